@@ -31,6 +31,7 @@ for package in (liethermo, manifolds):  # what is imported on demand as an attri
         if inspect.ismodule(value := getattr(package, name)):
             sys.modules.setdefault(f"{package.__name__}.{name}", value)
 
+import api_members  # noqa: E402
 import beside  # noqa: E402
 from facts import write_facts  # noqa: E402
 from made_by import digest, forget_others  # noqa: E402
@@ -53,6 +54,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
     "numpydoc",
     "myst_parser",
     "sphinx_copybutton",
@@ -76,6 +78,8 @@ notebook_folders = ("tutorials/",)
 never_executed = ["reference/changelog"]
 
 autosummary_generate = True
+autosummary_context = {"class_pages": api_members.pages()}
+viewcode_line_numbers = True
 autodoc_typehints = "none"  # the docstrings state the types
 autodoc_member_order = "bysource"
 toc_object_entries_show_parents = "hide"
@@ -127,44 +131,6 @@ html_sidebars = {"index": []}
 html_context = {"default_mode": "auto"}  # else the theme complains to a first visitor
 
 
-INTERNALS = frozenset(
-    """
-    accessed_names across added_momentum algebra_by_constants as_provenance balance_entries base_step
-    bind_attitude bind_to bind_to_structure block_results body_at_attitude body_dim can_be_embedded
-    can_transport_attitude can_unroll carries_compensation check_components clock_components component_scales
-    consecutive_increments constant_names couplings decompose difference_quotient difference_rounding_scale
-    dim_without_ledger displace dissipation_keeps_casimirs dissipations divergence_terms dot_at_sites drop_baths
-    drop_ledger drop_torque energy_of_vectors entropy_gradient evaluations_per_iteration extend external_torque
-    factor_at_state field_and_law_rates first_velocity_index freeze_at friction_at general generator_field
-    grid_seeds has_impulse has_ledger has_matrix_functions has_poisson_by_construction heating_sites
-    impulse_names initial initial_compensation initial_run_state initial_state inner inner_arguments inner_at
-    input_residuals intervals invariant_names invariant_verdicts is_coordinate_order_independent is_hidden
-    is_noiseless is_projection_trivial is_smooth jackknife_blocks jacobian_probe join_state ledger ledger_rates
-    local_system lower_index make_blocks map_defect mechanical_energy member_stats member_status
-    method_with_noise midpoint_gradients momentum_jacobians momentum_system needs_attitude noisy nonnegative
-    orbit_levels outer_scalars precession_rates predict preserved_labels preserves_function production_name
-    pullback pullback_to_chart raise_index rate_of_change record_initial requested_invariants residual_jvp
-    residual_weights rounding_scale row_counts row_pointer samples scale_at_sites site_spins solution_builder
-    solved_subsystem sparsity_pattern specific_residuals split_state stage_velocities start_blocks state_array
-    state_blocks step_without_compensation surface system_without_span temperature_at term_index
-    to_user_solution to_user_state torque_arguments torque_free_components torque_invariant_casimirs torque_name
-    torque_velocity torques_need_attitude trajectory_numbers transport user_state user_state_at uses_charts
-    value_type why_singular why_step_failed
-    """.split()
-)
-"""Members that the rooms of the library ask of each other: no user calls them, so the reference leaves them out."""
-
-
-def _is_internal(app, what, name, value, skip, options):
-    return True if what == "class" and name in INTERNALS else None
-
-
-def _is_bare_value(app, what, name, value, skip, options):
-    """Leave out attributes that are mere values: autodoc would print the documentation of their type."""
-    told = callable(value) or isinstance(value, (property, classmethod, staticmethod)) or hasattr(value, "__get__")
-    return True if what == "class" and not told else None
-
-
 def _say_what_thumbnails_show(app, pagename, templatename, context, doctree):
     """Give each picture of the gallery the title of its example as its words."""
     if pagename.startswith("gallery/") and "body" in context:
@@ -185,6 +151,4 @@ def _read_as_meant(app, what, name, value, options, lines):
 
 def setup(app):
     app.connect("autodoc-process-docstring", _read_as_meant)
-    app.connect("autodoc-skip-member", _is_internal)
-    app.connect("autodoc-skip-member", _is_bare_value)
     app.connect("html-page-context", _say_what_thumbnails_show)

@@ -42,6 +42,24 @@ def test_the_example_of_a_main_name_is_true(package, name, tmp_path, monkeypatch
     assert _run_doctest(inspect.getdoc(operator.attrgetter(name)(package)) or "", name) > 0, "no example"
 
 
+NAMES_WITH_EXAMPLE = [
+    (package, name)
+    for package in (lt, mf)
+    for name in package.__all__
+    if (package, name) not in MAIN
+    and callable(thing := getattr(package, name))
+    and "\n>>> " in (inspect.getdoc(thing) or "")
+]
+"""Public names that have an example, besides the main ones."""
+
+
+@pytest.mark.sampled(4)
+@pytest.mark.parametrize(("package", "name"), NAMES_WITH_EXAMPLE, ids=[name for _, name in NAMES_WITH_EXAMPLE])
+def test_the_example_of_another_public_name_is_true(package, name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert _run_doctest(inspect.getdoc(getattr(package, name)), name) > 0
+
+
 @pytest.mark.parametrize("name", [name for _, name in MAIN])
 def test_every_main_name_has_an_example(name):
     package = next(package for package, main_name in MAIN if main_name == name)

@@ -42,6 +42,16 @@ class Friction(Damping):
         Factor of D, in the units described there.
     bath : int, or array of int of the shape of the sites, optional
         The number of the bath that takes the heat, from 0; by default the first.
+
+    Examples
+    --------
+    An oscillator with drag loses energy:
+
+    >>> J = np.array([[0.0, 1.0], [-1.0, 0.0]])
+    >>> oscillator = lt.MetriplecticSystem(J, lt.Quadratic(np.ones(2)), None, lt.Friction([0.0, 0.2]))
+    >>> run = lt.integrate(oscillator, [1.0, 0.0], (0.0, 20.0), 0.1)
+    >>> bool(run.energy[-1] < 0.03 * run.energy[0]), run.audit().passed
+    (True, True)
     """
 
     D: Callable | jax.Array | None

@@ -320,6 +320,12 @@ class Function(Energy):
     """An energy given by a plain function from a JAX array, shape (n,), to a scalar; JAX differentiates it.
 
     The function may be an ``equinox.Module``, whose arrays are then parameters of the system.
+
+    Examples
+    --------
+    >>> well = lt.Function(lambda x: x[0] ** 4 / 4 - x[0] ** 2 / 2)
+    >>> print(well.gradient(np.array([2.0])))
+    [6.]
     """
 
     function: Callable
@@ -346,6 +352,13 @@ class TimeDependent(Energy, FunctionWithBreaks):
         The function may be an ``equinox.Module``, whose arrays are then parameters of the system.
     breaks : sequence of float
         Times at which the function jumps or has a kink; the steps of a run end there.
+
+    Examples
+    --------
+    >>> field = lt.TimeDependent(lambda x, t: -jnp.cos(t) * x[0])
+    >>> energy = lt.Quadratic(np.ones(2)) + field
+    >>> float(energy(np.array([1.0, 0.0]), 0.0))
+    -0.5
     """
 
     function: Callable

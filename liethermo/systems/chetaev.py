@@ -38,13 +38,14 @@ PRODUCTION_ROUNDING_RTOL = 1e-12
 
 
 class ChetaevSystem(SimpleClosedSystem):
-    """``d/dt L_v - L_q = lambda eta_q``, ``-L_S = lambda eta_S``, ``eta_q . q' + eta_S S' = 0`` [SML Def. 3.1, 13-14].
+    """A mechanical system whose friction and heat are given by a one-form that vanishes on its motion [SML §3.2].
 
-    These are the equations of the generalised Chetaev principle on Q x R, in the state (q, v, S), for a Lagrangian
+    The equations are ``d/dt L_v - L_q = lambda eta_q``, ``-L_S = lambda eta_S``, ``eta_q . q' + eta_S S' = 0`` [SML
+    13-14]: those of the generalised Chetaev principle [SML Def. 3.1] on Q x R, in the state (q, v, S), for a Lagrangian
     L(q, v, S) and a semibasic one-form ``eta = eta_q dq + eta_S dS``. So ``lambda = T / eta_S`` with ``T = -L_S > 0``:
     the form is a force ``T eta_q / eta_S``, and the heat that it makes. The energy ``E = v . L_v - L`` is constant,
-    whatever the form is, since ``E' = lambda (eta_q . v + eta_S S') = 0``. The entropy production is
-    ``S' = -eta_q . v / eta_S``; where it is not negative at random points, the second law is stated, and held to.
+    whatever the form is, since ``E' = lambda (eta_q . v + eta_S S') = 0``. The entropy production is ``S' = -eta_q . v
+    / eta_S``; where it is not negative at random points, the second law is stated, and held to.
 
     For ``eta = dS - L_v dq`` this is :class:`liethermo.ThermodynamicHerglotz` [SML Prop. 3.3], and for
     ``eta = T dS + F_fr dq`` a :class:`liethermo.SimpleClosedSystem` with the friction F_fr.

@@ -111,14 +111,14 @@ class EulerPoincareSystem(LiePoissonSystem):
         return eqx.tree_at(lambda s: (s.lagrangian, s.energy), system, (lagrangian, Legendre(lagrangian)))
 
     def velocity(self, mu, t=None) -> jax.Array:
-        """xi = dH/dmu at a state or batch of states, shape (..., dim); at a time, where the Lagrangian needs one."""
+        """Return the velocity ``xi = dH/dmu`` of states, shape (..., dim), at the time t if the Lagrangian needs it."""
         return evaluate_batch(self.drop_torque(), lambda system, mu: system.energy.gradient(mu), mu, t, "(n)")
 
     def momentum_of_velocity(self, xi, t=None):
         return self.momentum(xi, t)
 
     def momentum(self, xi, t=None) -> jax.Array:
-        """mu = dl/dxi, shape (..., dim); likewise."""
+        """Return the momentum ``mu = dl/dxi`` of velocities, shape (..., dim), at the time t if it is needed."""
         return evaluate_batch(self.drop_torque(), lambda system, xi: system.lagrangian.gradient(xi), xi, t, "(n)")
 
 

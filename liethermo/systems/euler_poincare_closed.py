@@ -27,14 +27,15 @@ from .torque import begins_with_rotations
 
 
 class EulerPoincareClosedSystem(LedgerSystem):
-    """``d/dt l_xi = ad*_xi l_xi + f + F``, ``T S' = P_H - f·xi``, ``T = -l_S > 0``: a body that its friction heats.
+    """A body that turns or moves by the elements of a group, and that its own friction heats [GBY §2.2].
 
-    These are the equations (2.4) of a Lagrangian ``L(g, g', S) = l(g^-1 g', S)`` on TG x R: the variations of GBY §2.2
-    with ``delta xi = eta' + [xi, eta]`` and the constraint ``l_S delta S = f . eta``. The energy ``xi . l_xi - l`` is
-    constant and the entropy does not fall, as long as ``f . xi <= 0``, which :meth:`check` tests. The spatial momentum
-    ``Ad*_{g^-1} l_xi`` is constant in the directions that commute with all others in which f acts: friction between the
-    parts of a body does not touch its angular momentum. So the Casimirs of the algebra are constants, as functions of
-    the body's momentum ``l_xi``, unless f changes them: these are :meth:`casimirs`.
+    It obeys ``d/dt l_xi = ad*_xi l_xi + f + F`` and ``T S' = P_H - f·xi`` with ``T = -l_S > 0``, the equations (2.4) of
+    a Lagrangian ``L(g, g', S) = l(g^-1 g', S)`` on TG x R: the variations of GBY §2.2 with ``delta xi = eta' + [xi,
+    eta]`` and the constraint ``l_S delta S = f . eta``. The energy ``xi . l_xi - l`` is constant and the entropy does
+    not fall, as long as ``f . xi <= 0``, which :meth:`check` tests. The spatial momentum ``Ad*_{g^-1} l_xi`` is
+    constant in the directions that commute with all others in which f acts: friction between the parts of a body does
+    not touch its angular momentum. So the Casimirs of the algebra are constants, as functions of the body's momentum
+    ``l_xi``, unless f changes them: these are :meth:`casimirs`.
 
     The state is (xi, S), shape (dim + 1,). With an external force F or a heat power it has three more components, the
     work W' = F . xi and the heat Q' = P_H received so far, and the time: see :class:`liethermo.SimpleClosedSystem`.

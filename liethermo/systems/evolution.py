@@ -159,7 +159,7 @@ class EvolutionSystem(MomentumContactSystem):
     production_name: ClassVar[str] = "Delta_Q H"
 
     def temperature(self, x, t=None) -> jax.Array:
-        """``T = H_S`` at a state or a batch of states, shape (...); at a time, where the energy depends on one."""
+        """Return the temperature ``T = H_S`` of states, shape (...), at the time t if the energy depends on it."""
         return evaluate_batch(self, lambda system, y: system.energy.gradient(y)[-1], x, t, "()")
 
 

@@ -97,10 +97,10 @@ class SystemInterface(Geometry):
     # -- dynamics -----------------------------------------------------------------------------------------------------
 
     def field(self, x, dH, dS, dL=()) -> jax.Array:
-        """``Pi(x) dH + force(x; dH, dS, dL)``, shape (n,), for gradients continuous or discrete.
+        """Return the vector field at x for given gradients, continuous or discrete, shape (n,).
 
-        dS is None if the system has no entropy. This is the one definition of the dynamics; integrators differ in the
-        gradients that they pass.
+        It is ``Pi(x) dH + force(x; dH, dS, dL)``. dS is None if the system has no entropy. This is the one definition
+        of the dynamics; integrators differ in the gradients that they pass.
         """
         motion = self.poisson.sharp(x, dH)
         return motion if self.dissipation is None else motion + self.dissipation.force(self, x, dH, dS, dL)

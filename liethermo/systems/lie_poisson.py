@@ -33,7 +33,10 @@ from .torque import (
 
 
 class LiePoissonSystem(TorqueSystem):
-    """``mu' = ad*_{grad H} mu + K grad S`` on g* [BFM 3.1, §3].
+    """A system on the dual of a Lie algebra, such as a rigid body, a spin or a fluid, with dissipation [BFM 3.1, §3].
+
+    The momentum mu moves by ``mu' = ad*_{grad H} mu + K grad S``: along its coadjoint orbit by the energy H, and by the
+    dissipation K towards more entropy S.
 
     On copies of an algebra, ``g ** sites``, a state is an array of shape ``(*sites, g.dim)``, in functions and in
     solutions. Flat states are used by ``lt.Quadratic``, by terms on components (``lt.Each``, ``.on(...)``), by Casimirs

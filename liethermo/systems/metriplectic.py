@@ -20,7 +20,9 @@ from .embedded import EmbeddedSystem
 
 
 class MetriplecticSystem(System):
-    """``x' = Pi(x) grad H + K(x) grad S`` on R^n or on a manifold [BFM 2.3, §4.4].
+    """A system with energy, entropy and dissipation on R^n or on a manifold, in its most general form [BFM 2.3, §4.4].
+
+    The state moves by ``x' = Pi(x) grad H + K(x) grad S``, with a Poisson tensor Pi and a friction matrix K.
 
     Parameters
     ----------

@@ -258,7 +258,7 @@ class QuantumSystem(System):
         return jnp.einsum("...iajibj->...ab", tensor)
 
     def expectation(self, x, observable) -> jax.Array:
-        """``tr(rho A)`` of states, shape (..., n) to (...), for an observable A, Hermitian, shape (N, N)."""
+        """Return ``tr(rho A)`` of states, shape (..., n) to (...), for an observable A, Hermitian, shape (N, N)."""
         observable = checked_hermitian(observable, "the observable")
         if observable.shape != (self.structure.size,) * 2:
             raise InputError(

@@ -111,14 +111,14 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
         return self.contact.tangential_part(q, v)
 
     def legendre(self, x) -> jax.Array:
-        """``FL(q, v, S) = (q, L_v, S)`` at a state or a batch of states, shape (..., 2n + 1)."""
+        """Return the Legendre transform ``(q, L_v, S)`` of a state or a batch of states, shape (..., 2n + 1)."""
         return jnp.vectorize(self.contact.legendre, signature="(n)->(n)")(self.drop_ledger(x))
 
     def temperature_at(self, y) -> jax.Array:
         return -self.lagrangian.gradient(y)[-1]
 
     def mechanical_energy(self, x) -> jax.Array:
-        """``E = v·L_v - L``, without the ledger, shape (...)."""
+        """Return the energy ``E = v·L_v - L`` of states, without the ledger, shape (...)."""
         return jnp.vectorize(self.contact.energy, signature="(n)->()")(self.drop_ledger(x))
 
     own_energy = mechanical_energy  # its name in 0.2
@@ -126,11 +126,11 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
     # -- the functions, at one point ----------------------------------------------------------------------------------
 
     def lagrangian_value(self, q, v, S) -> jax.Array:
-        """``L(q, v, S)``."""
+        """Return the Lagrangian ``L(q, v, S)``, shape ()."""
         return self.lagrangian.value(jnp.concatenate([q, v, jnp.reshape(S, 1)]))
 
     def momentum(self, q, v, S) -> jax.Array:
-        """``L_v``, shape (n,)."""
+        """Return the momentum ``L_v``, shape (n,)."""
         return jax.grad(self.lagrangian_value, argnums=1)(q, v, S)
 
     def momentum_jacobians(self, x) -> tuple[jax.Array, jax.Array]:

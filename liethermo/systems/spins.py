@@ -37,7 +37,9 @@ SPIN_LENGTHS_NAME = "sum |s|^2 / 2"
 
 
 class SpinSystem(TorqueSystem):
-    """``s_i' = gamma_i s_i x grad_i H`` at every site, damped, alone or with baths of their own entropies.
+    """Classical spins that precess and are damped, on their own or with baths that take their heat.
+
+    They obey the Landau-Lifshitz equation: ``s_i' = gamma_i s_i x grad_i H`` at every site i, plus damping.
 
     A state is ``(s_1, s_2, …, y_1, …, y_m)`` in one row: the spins site by site in C order, then the entropy of each
     bath. Baths have the energy ``U(y)``, and ``T_b = dU/dy_b`` is their temperature; energy and entropy of the whole
@@ -66,6 +68,15 @@ class SpinSystem(TorqueSystem):
     Raises
     ------
     InputError, FunctionError, AxiomError
+
+    Examples
+    --------
+    A spin in a field along the third axis, damped towards it:
+
+    >>> system = lt.SpinSystem(1, lt.magnetism.zeeman(1, [0.0, 0.0, 1.0]), lt.LandauLifshitz(0.5))
+    >>> spin = lt.integrate(system, [[1.0, 0.0, 0.0]], (0.0, 20.0), 0.1)
+    >>> bool(spin.x[-1, 2] > 0.999), spin.audit().passed
+    (True, True)
     """
 
     lattice: tuple[int, ...] = eqx.field(static=True)

@@ -40,6 +40,15 @@ class Grassmann(Space):
     A tangent vector v at x is ``[W, x]`` for the skew ``W = [v, x]``, and the geodesic ``expm(W) x expm(-W)``. Its
     length is sqrt(2) times the root of the sum of the squared principal angles [Bendokat, Zimmermann & Absil 2024]. The
     logarithm is unique if no principal angle is a right angle.
+
+    Examples
+    --------
+    The distance of two lines in the plane at an angle of 0.3 is ``sqrt(2) * 0.3``:
+
+    >>> space = mf.Grassmann(2, 1)
+    >>> line = lambda angle: np.outer(*2 * [[np.cos(angle), np.sin(angle)]])
+    >>> round(float(space.distance(line(0.0), line(0.3)) / np.sqrt(2.0)), 12)
+    0.3
     """
 
     n: int

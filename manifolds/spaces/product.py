@@ -25,6 +25,13 @@ class Product(Space):
     """Product of several spaces, also written ``A * B``: a point is one flat array of the factors' points in order.
 
     :meth:`split` and :meth:`join` convert between that array and the points of the factors. The metric is the sum.
+
+    Examples
+    --------
+    >>> space = mf.Sphere(2) * mf.Euclidean(1)
+    >>> x = space.join(np.array([0.0, 0.0, 1.0]), np.array([5.0]))
+    >>> x.shape, space.dim, bool(space.belongs(x))
+    ((4,), 3, True)
     """
 
     factors: tuple[Space, ...]

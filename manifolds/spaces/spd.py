@@ -41,9 +41,17 @@ class SPD(PositiveDefinite):
 
     The metric is invariant under every ``x -> g x g^T``; it makes the space complete and of nonpositive curvature, so
     that exp and log are one to one everywhere [Pennec, Fillard & Ayache 2006]. The formulas use the Cholesky factor L
-    of x
-    instead of their square root: ``exp(x, v) = L expm(L^-1 v L^-T) L^T``. The result is known to rounding of its
+    of x instead of their square root: ``exp(x, v) = L expm(L^-1 v L^-T) L^T``. The result is known to rounding of its
     largest entry, so eigenvalues smaller than that by 1e16 are lost.
+
+    Examples
+    --------
+    The midpoint of two matrices is their geometric mean:
+
+    >>> space = mf.SPD(2)
+    >>> print(np.round(space.midpoint(np.eye(2), np.diag([4.0, 9.0])), 12))
+    [[2. 0.]
+     [0. 3.]]
     """
 
     n: int

@@ -39,9 +39,16 @@ class Stiefel(Space):
     themselves or out of their span. A tangent vector v at x is ``W x`` for one skew W of least norm; the geodesic is
     ``expm(t W) x`` [Edelman, Arias & Smith 1998]. Parallel transport solves the linear equation
     ``eta' = -[W, eta]/2``, projected, of a naturally reductive space. The logarithm has no closed form: Gauss and
-    Newton's
-    method computes it from the projected chord, and it is accepted inside the injectivity radius only, where
+    Newton's method computes it from the projected chord, and it is accepted inside the injectivity radius only, where
     it is unique. That radius is pi for p = 1 and p = n - 1; otherwise the bound ``2 pi / sqrt 5`` [Rentmeesters 2013].
+
+    Examples
+    --------
+    >>> space = mf.Stiefel(4, 2)
+    >>> x = space.random(0)
+    >>> v = 0.1 * space.random_tangent(1, x)
+    >>> bool(np.allclose(space.log(x, space.exp(x, v)), v))
+    True
     """
 
     n: int

@@ -194,6 +194,12 @@ class PoissonTensor(PoissonStructure):
 
     The tensor is not checked: ``jacobi_residual`` measures the Jacobi identity at a point, and a dynamical system
     built on the structure checks skewness and Jacobi at random points.
+
+    Examples
+    --------
+    >>> rotations = mf.PoissonTensor(lambda x: jnp.cross(jnp.eye(3), x), 3)
+    >>> print(rotations.rank(np.array([0.0, 0.0, 1.0])), bool(rotations.jacobi_residual(np.ones(3)) < 1e-14))
+    2 True
     """
 
     matrix: Callable | jax.Array

@@ -36,6 +36,13 @@ class VariationalGauss(GaussMethod):
     ----------
     stages : int
         1 to 8.
+
+    Examples
+    --------
+    >>> spring = lt.models.mass_spring_gas()
+    >>> run = lt.integrate(spring, [1.0, 0.0, 0.0], (0.0, 5.0), 0.1, lt.VariationalGauss(2))
+    >>> run.status.ok, bool(run.entropy[-1] > run.entropy[0])
+    (True, True)
     """
 
     systems = "simple closed systems"
