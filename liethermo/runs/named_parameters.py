@@ -170,8 +170,6 @@ def _public_name(fields: list[str]) -> str:
     elif fields[:2] in (["energy", "baths"], ["baths", "energy"]):
         # a bath of infinite capacity has the linear energy T S
         fields = ["baths", *("temperature" if field == "b" else field for field in fields[2:])]
-    elif fields[0] == "friction":
-        fields = ["dissipation", *fields]
     name = previous = fields[0]
     for field in (*(f for f in fields[1:-1] if f not in WRAPPER_FIELDS), *fields[1:][-1:]):
         if field != previous:  # not the friction of a friction

@@ -87,7 +87,7 @@ def test_every_parameter_of_a_model_keeps_the_laws_and_has_an_effect(name):
         return [np.asarray(value) for value in values]
 
     for parameter, value in named_parameters(system).items():
-        if parameter.startswith(("dissipation", "baths", "lagrangian")) or parameter.endswith("inertia"):
+        if parameter.startswith(("dissipation", "baths", "friction", "lagrangian")) or parameter.endswith("inertia"):
             changed_system = replace_parameters(system, {parameter: 1.03 * value})
             assert changed_system.check().passed, parameter
             pairs = zip(functions_of(system), functions_of(changed_system), strict=True)
