@@ -13,6 +13,7 @@ import numpy as np
 from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
 from ..errors import InputError
 from ..functions.energy import Quadratic
+from ..models.inertia import inverse_inertia
 from ..systems import System
 from ..tracing.caching import memoize
 
@@ -43,7 +44,9 @@ class NamedParameter(NamedTuple):
         """Return the entry of the arrays for a value of the parameter, or for several along the first axis."""
         if not self.is_inverse:
             return value
-        return 1.0 / value if np.shape(self.value) == (3,) else jnp.linalg.inv(value)
+        if np.shape(self.value) == (3,):  # entry by entry, also of several sets of moments
+            return inverse_inertia(jnp.ravel(value)).reshape(np.shape(value))
+        return jnp.linalg.inv(value)
 
 
 def named_parameters(system: System) -> dict[str, np.ndarray]:

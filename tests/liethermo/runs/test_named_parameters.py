@@ -169,3 +169,12 @@ def test_an_unknown_name_lists_those_that_there_are():
 def test_a_lagrangian_that_the_energy_was_computed_from_is_no_parameter():
     with pytest.raises(lt.InputError, match="a function that builds the system"):
         replace_parameters(lt.models.mass_spring_gas(), {"lagrangian.summands[0].A": np.ones(3)})
+
+
+def test_a_moment_of_zero_is_that_of_a_rod():
+    """It has no inverse, and the rod does not turn about that axis; as a member of a family it ends no other one."""
+    system = lt.LiePoissonSystem(mf.so(3), energy_of(MOMENTS), dissipation=lt.DoubleBracket(0.1))
+    rod = replace_parameters(system, {"energy.inertia": [0.0, 2.0, 2.0]})
+    np.testing.assert_array_equal(rod.energy.A, [0.0, 0.5, 0.5])
+    many = lt.ensemble(system, START, SPAN, 0.1, parameters={"energy.inertia": [[0.0, 2.0, 2.0], MOMENTS]})
+    np.testing.assert_allclose(many.x[1], last_state(system), rtol=1e-14)
