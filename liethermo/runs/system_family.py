@@ -97,7 +97,7 @@ class Family:
             )
         for name, values in parameters.items():
             has_moments = name.endswith("inertia") and find_parameter(system, name).value.shape == (3,)
-            if has_moments and are_inertia_tensors(values):
+            if has_moments and are_inertia_tensors(np.asarray(values, dtype=np.float64)):
                 raise InputError(
                     f"the values of {name} are the tensor of inertia of one body, but three sets of principal moments "
                     "are expected. Give the moments of each trajectory as a row, or a system with a tensor"
