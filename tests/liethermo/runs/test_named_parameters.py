@@ -172,7 +172,7 @@ def test_a_lagrangian_that_the_energy_was_computed_from_is_no_parameter():
 
 
 def test_a_moment_of_zero_is_that_of_a_rod():
-    """It has no inverse, and the rod does not turn about that axis; as a member of a family it ends no other one."""
+    """The rod does not turn about that axis; as a member of a family it ends no other one."""
     system = lt.LiePoissonSystem(mf.so(3), energy_of(MOMENTS), dissipation=lt.DoubleBracket(0.1))
     rod = replace_parameters(system, {"energy.inertia": [0.0, 2.0, 2.0]})
     np.testing.assert_array_equal(rod.energy.A, [0.0, 0.5, 0.5])
