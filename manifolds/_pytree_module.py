@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from copy import copy
 from types import MethodType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import equinox as eqx
 import jax
+
+Copied = TypeVar("Copied", bound=eqx.Module)
 
 
 class Module(eqx.Module):
@@ -35,6 +38,17 @@ def _is_module_method(leaf: Any) -> bool:
 
 def _method_to_partial(leaf: Any) -> Any:
     return eqx.Partial(leaf.__func__, leaf.__self__) if _is_module_method(leaf) else leaf
+
+
+def replace_fields(module: Copied, **fields: Any) -> Copied:
+    """Return a copy of a module with other values of some fields; its constructor is not called.
+
+    What the module has cached is copied too, so the fields must not affect it.
+    """
+    copied_module = copy(module)
+    for name, value in fields.items():
+        object.__setattr__(copied_module, name, value)
+    return copied_module
 
 
 class _ForwardedMember:

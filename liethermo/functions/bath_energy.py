@@ -135,10 +135,14 @@ class _ReservoirEnergyOfTime(StateTimeEnergy):
         return jnp.stack([0.5 * (first + last), rate * (y + 0.5 * change)])
 
 
+def bath_terms(energy: Energy) -> list[Energy]:
+    """Return the terms of the energy of baths, each as a function of the entropies of its own baths."""
+    return [term.term if isinstance(term, Pullback) else term for term in energy.terms]
+
+
 def keeps_temperatures(energy: Energy) -> bool:
     """Return whether no temperature of some baths with this energy depends on their entropies."""
-    terms = (term.term if isinstance(term, Pullback) else term for term in energy.terms)
-    return all(isinstance(term, ReservoirEnergy | DrivenReservoirEnergy) for term in terms)
+    return all(isinstance(term, ReservoirEnergy | DrivenReservoirEnergy) for term in bath_terms(energy))
 
 
 def make_bath_energy(capacity: jax.Array, temperature: jax.Array) -> BathEnergy | ReservoirEnergy:

@@ -19,15 +19,10 @@ from ..errors import InputError
 from ..systems import DrivenSystem, QuantumSystem, System
 from .base import OneStepMethod, kind_or_class_name, register
 from .explicit import StepRow
+from .runge_kutta import END_SLOPE_ROW, weights_of_cubic
 
 KRAUS_ORDERS = (2, 4)
 """Orders of :class:`KrausMethod`."""
-
-START_SLOPE_ROW = StepRow.FIRST_METHOD_ROW
-"""Row of ``k`` that holds the slope at the start of a step."""
-
-END_SLOPE_ROW = StepRow.FIRST_METHOD_ROW + 1
-"""Row of ``k`` that holds the slope at the end of a step."""
 
 SIMPSON_WEIGHTS = np.array([1.0, 4.0, 1.0]) / 6.0
 """Weights of Simpson's rule at the start, the middle and the end of an interval; all are positive."""
@@ -126,13 +121,7 @@ class KrausMethod(OneStepMethod):
         return h * k[StepRow.MEAN_SLOPE]
 
     def weights(self, theta) -> np.ndarray:
-        """Return the weights of the cubic through both ends and their slopes; its error in the step is O(h^4)."""
-        theta = np.asarray(theta, dtype=np.float64)
-        row_weights = np.zeros((*theta.shape, self.stages))
-        row_weights[..., StepRow.MEAN_SLOPE] = theta**2 * (3.0 - 2.0 * theta)
-        row_weights[..., START_SLOPE_ROW] = theta * (1.0 - theta) ** 2
-        row_weights[..., END_SLOPE_ROW] = theta**2 * (theta - 1.0)
-        return row_weights
+        return weights_of_cubic(theta, self.stages)
 
 
 class _Channel(NamedTuple):

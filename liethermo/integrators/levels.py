@@ -129,16 +129,6 @@ def project_onto_levels(
         """Return the largest change of each function in a displacement with the length of d in each block."""
         return jnp.stack([sum(jnp.linalg.norm(v[b]) * jnp.linalg.norm(d[b]) for b in blocks) for v in change_vectors])
 
-    def start_changes(d) -> jax.Array:
-        """Return :func:`largest_changes` with the gradients at the start of the step."""
-        begin = x + compensation
-        vectors = (
-            [system.raise_index(begin, v) for v in start_gradients]
-            if leaf
-            else correction_directions(system, begin, start_gradients)
-        )
-        return largest_changes(vectors, d)
-
     def change_gradient(f: Energy, d, start_gradient, end_gradient) -> jax.Array:
         """Return the discrete gradient of f along d; for a polynomial by a quadrature with gradients at both ends."""
         mean = 0.5 * (start_gradient + end_gradient)
@@ -200,7 +190,7 @@ def project_onto_levels(
         if work_direction is None:
             correction = level_correction(system, directions, s.level_residual)
         else:
-            start_lengths = start_changes(s.d) / jnp.maximum(jnp.linalg.norm(s.d), VANISHED_LENGTH)
+            start_lengths = largest_changes(start_vectors, s.d) / jnp.maximum(jnp.linalg.norm(s.d), VANISHED_LENGTH)
             is_unreachable = is_level_unreachable(s, largest_changes(change_vectors, s.d))
             lengths = jnp.maximum(lengths, MIN_MEAN_GRADIENT * start_lengths)
             work = s.level_residual * jnp.stack([jnp.dot(v, work_direction) for v in end_gradients])
@@ -214,7 +204,7 @@ def project_onto_levels(
         The gradient of a function then nearly vanishes at the end of the step, and Newton's correction of the residual
         would be longer than half of the distance to the rest. A step that is too long for its residual is no such step.
         """
-        changes, residual = start_changes(s.d), jnp.abs(s.level_residual)
+        changes, residual = largest_changes(start_vectors, s.d), jnp.abs(s.level_residual)
         is_out_of_reach = 4.0 * residual * changes > end_changes**2
         return (end_changes < MIN_MEAN_GRADIENT * changes) & is_out_of_reach & (residual <= MAX_WORK_RTOL * changes)
 
@@ -299,6 +289,14 @@ def project_onto_levels(
 
         return jnp.stack([function_rounding(f, start) for f, start in zip(functions, start_gradients, strict=True)])
 
+    start_vectors: list[jax.Array] = []
+    if work_direction is not None:
+        begin = x + compensation
+        start_vectors = (
+            [system.raise_index(begin, v) for v in start_gradients]
+            if leaf
+            else correction_directions(system, begin, start_gradients)
+        )
     zero_residual = jnp.zeros(len(laws))
     start_d, start_correction = (jnp.zeros_like(d), -d) if leaf else (d, jnp.zeros_like(d))
     s = with_next_correction(

@@ -27,6 +27,28 @@ QUADRATURE_ERROR_ROW = StepRow.FIRST_METHOD_ROW + 2
 """Row of ``k`` that holds the estimate of the error of a quadrature, over h."""
 
 
+def weights_of_cubic(theta, n_rows: int) -> np.ndarray:
+    """Return the weights of the cubic through both ends of a step and their slopes; its error in the step is O(h^4).
+
+    Parameters
+    ----------
+    theta : array, shape (...)
+        Times since the start of the step, over its size.
+    n_rows : int
+        Number of rows of slopes, of which three have a weight.
+
+    Returns
+    -------
+    array, shape (..., n_rows)
+    """
+    theta = np.asarray(theta, dtype=np.float64)
+    row_weights = np.zeros((*theta.shape, n_rows))
+    row_weights[..., StepRow.MEAN_SLOPE] = theta**2 * (3.0 - 2.0 * theta)
+    row_weights[..., START_SLOPE_ROW] = theta * (1.0 - theta) ** 2
+    row_weights[..., END_SLOPE_ROW] = theta**2 * (theta - 1.0)
+    return row_weights
+
+
 class MetriplecticRungeKutta(ExplicitMethod):
     """Explicit Runge-Kutta steps with both laws exact, of order 4, 6 or 8.
 
@@ -144,13 +166,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
         return jax.lax.scan(stage, jnp.zeros((s, x.shape[0])), (np.arange(s), t.A))
 
     def weights(self, theta) -> np.ndarray:
-        """Return the weights of the cubic through both ends and their slopes; its error in the step is O(h^4)."""
-        theta = np.asarray(theta, dtype=np.float64)
-        row_weights = np.zeros((*theta.shape, self.stages))
-        row_weights[..., StepRow.MEAN_SLOPE] = theta**2 * (3.0 - 2.0 * theta)
-        row_weights[..., START_SLOPE_ROW] = theta * (1.0 - theta) ** 2
-        row_weights[..., END_SLOPE_ROW] = theta**2 * (theta - 1.0)
-        return row_weights
+        return weights_of_cubic(theta, self.stages)
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
         """Return the larger one of the two estimates of :class:`.lobatto.ExplicitTableau`."""

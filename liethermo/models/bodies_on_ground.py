@@ -3,26 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from copy import copy
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 import manifolds as mf
-from manifolds._arrays import is_traced
 from manifolds._precision import with_library_settings
+from manifolds._pytree_module import replace_fields
 
 from ..errors import InputError
-from ..functions.energy import Energy
 from ..systems import HeatBaths
-from .articulated_bodies import ArticulatedBodies, JointDamping, JointSprings, KineticEnergy, WeightPotential
-from .joint_states import JointMotors, JointRange, TreeSystem, broadcast_batches, sum_of_terms
+from ..systems.torque import TorqueSystem
+from .articulated_bodies import ArticulatedBodies, JointSprings, WeightPotential
+from .joint_states import (
+    JointMotors,
+    JointRange,
+    TreeSystem,
+    broadcast_batches,
+    joint_damping,
+    kinetic_and_spring_terms,
+    sum_of_terms,
+)
 
 
-class BodiesOnGround(TreeSystem):
+class BodiesOnGround(TreeSystem, TorqueSystem):
     """A tree of jointed rigid bodies on the ground, such as pendulums and arms, on ``T*Q``; :meth:`Tree.system` builds
     it.
 
@@ -33,12 +39,9 @@ class BodiesOnGround(TreeSystem):
     Attributes
     ----------
     motors : JointMotors or None
-    motor_time : array, shape (), or None
-        Time at which the torques of the motors are taken: see :meth:`at_time`.
     """
 
     motors: JointMotors | None
-    motor_time: jax.Array | None
     _joint_ranges: tuple[JointRange, ...] = eqx.field(static=True)
 
     def __init__(
@@ -51,13 +54,12 @@ class BodiesOnGround(TreeSystem):
         motors: JointMotors | None = None,
         gravity: jax.Array | None = None,
     ):
-        self.motors, self.motor_time, self._joint_ranges = motors, None, joint_ranges
-        terms: list[Energy] = [KineticEnergy(mechanism)]
-        if is_traced(springs.stiffness) or np.asarray(springs.stiffness).any():
-            terms.append(springs)
+        self.torque, self.torque_arguments = None, None
+        self.motors, self._joint_ranges = motors, joint_ranges
+        terms = kinetic_and_spring_terms(mechanism, springs)
         if gravity is not None:
             terms.append(WeightPotential(mechanism, gravity))
-        dissipation = JointDamping(damping, 0) if is_traced(damping) or np.asarray(damping).any() else None
+        dissipation = joint_damping(damping, 0)
         k, validate = mechanism.n_joints, False  # the axioms hold for every tree
         self._build(mf.Canonical(k), 2 * k, sum_of_terms(terms), None, dissipation, (), validate, baths=baths)
 
@@ -68,40 +70,22 @@ class BodiesOnGround(TreeSystem):
     # -- the torques of the motors ------------------------------------------------------------------------------------
 
     @property
+    def has_torque(self) -> bool:
+        return self.motors is not None
+
+    @property
     def torque_name(self) -> str:
         return "" if self.motors is None else str(self.motors)
 
     has_impulse = False
 
-    @property
-    def is_driven(self) -> bool:
-        return self.motors is not None and self.motor_time is None
-
-    def at_time(self, t, attitude=None):
-        if self.motors is None:
-            return self
-        system = copy(self)
-        object.__setattr__(system, "motor_time", jnp.asarray(t, dtype=jnp.float64))
-        return system
-
-    def external_torque(self, x):
-        if self.motors is None:
-            return None
-        if self.motor_time is None:
-            raise InputError(f"the torque {self.torque_name} is known at a time: take system.at_time(t)")
-        k = self.mechanism.n_joints
-        return jnp.pad(self.motors(self.motor_time), (k, self.dim - 2 * k))
-
-    def field(self, x, dH, dS, dL=()):
-        torque = self.external_torque(x)
-        motion = super().field(x, dH, dS, dL)
-        return motion if torque is None else motion + torque
+    def _torque_at(self, x, t, attitude):
+        assert self.motors is not None
+        return jnp.pad(self.motors(t), (self.mechanism.n_joints, 0))
 
     def drop_torque(self):
-        system = copy(self)
-        for name in ("motors", "motor_time"):
-            object.__setattr__(system, name, None)
-        return system
+        system = super().drop_torque()
+        return system if system is self else replace_fields(system, motors=None)
 
     # -- states -------------------------------------------------------------------------------------------------------
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._arrays import is_traced
 from manifolds._precision import with_library_settings
 from manifolds._pytree_module import Module
 
@@ -18,7 +19,7 @@ from ..errors import InputError
 from ..functions.energy import Energy, Pullback, Sum
 from ..systems.base import System
 from ..tracing.programs import jit_unoptimised
-from .articulated_bodies import ArticulatedBodies, KineticEnergy, Motion
+from .articulated_bodies import ArticulatedBodies, JointDamping, JointSprings, KineticEnergy, Motion
 from .parameters import checked_finite
 
 MAX_UNROLLED_JOINTS = 4
@@ -152,6 +153,18 @@ def checked_vectors(value, name: str) -> jax.Array:
     if vector.shape[-1:] != (3,) or vector.ndim > 2:
         raise InputError(f"{name} must have shape (3,), or (B, 3) for many states, got {vector.shape}")
     return vector
+
+
+def kinetic_and_spring_terms(mechanism: ArticulatedBodies, springs: JointSprings) -> list[Energy]:
+    """Return the terms of the energy of a tree without gravity."""
+    has_springs = is_traced(springs.stiffness) or np.asarray(springs.stiffness).any()
+    return [KineticEnergy(mechanism), *([springs] if has_springs else [])]
+
+
+def joint_damping(coefficients, first_joint_index: int) -> JointDamping | None:
+    """Return the dampers of the joints; None without any."""
+    is_damped = is_traced(coefficients) or np.asarray(coefficients).any()
+    return JointDamping(coefficients, first_joint_index) if is_damped else None
 
 
 def sum_of_terms(terms: list[Energy]) -> Energy:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from copy import copy
 from typing import Any
 
 import equinox as eqx
@@ -12,16 +11,25 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds._arrays import is_traced
 from manifolds._precision import with_library_settings
+from manifolds._pytree_module import replace_fields
 from manifolds.structures.poisson import PoissonStructure, ProductPoisson
 
 from ..errors import InputError
 from ..functions.energy import Energy, Quadratic
 from ..systems import HeatBaths, LiePoissonSystem
 from ..tracing.programs import jit_unoptimised
-from .articulated_bodies import ArticulatedBodies, JointDamping, JointSprings, KineticEnergy, SquaredMomentum
-from .joint_states import JointMotors, JointRange, TreeSystem, broadcast_batches, checked_vectors, sum_of_terms
+from .articulated_bodies import ArticulatedBodies, JointSprings, KineticEnergy, SquaredMomentum
+from .joint_states import (
+    JointMotors,
+    JointRange,
+    TreeSystem,
+    broadcast_batches,
+    checked_vectors,
+    joint_damping,
+    kinetic_and_spring_terms,
+    sum_of_terms,
+)
 from .orbits import Orbit, direction_and_distance
 
 
@@ -70,9 +78,7 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         if self.orbit is not None and not attitude:
             raise InputError("gravity along an orbit depends on the attitude: leave out attitude=False")
         self.motors, self._joint_ranges = motors, joint_ranges
-        terms: list[Energy] = [KineticEnergy(mechanism)]
-        if is_traced(springs.stiffness) or np.asarray(springs.stiffness).any():
-            terms.append(springs)
+        terms = kinetic_and_spring_terms(mechanism, springs)
         poisson: PoissonStructure = ProductPoisson(mf.LiePoisson(algebra), mf.Canonical(k))
         dim = 3 + 2 * k
         if gravity is not None and not isinstance(gravity, Orbit):
@@ -81,9 +87,8 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
             poisson, dim = ProductPoisson(poisson, mf.Canonical(3)), n + 6
             falling = Quadratic(jnp.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) / mass, jnp.pad(-mass * gravity, (0, 3)))
             terms.append(falling.on(range(n, dim)))
-        dissipation = JointDamping(damping) if is_traced(damping) or np.asarray(damping).any() else None
         validate = False  # the axioms hold for every tree
-        self._build(poisson, dim, sum_of_terms(terms), None, dissipation, (), validate, baths=baths)
+        self._build(poisson, dim, sum_of_terms(terms), None, joint_damping(damping, 3), (), validate, baths=baths)
 
     @property
     def joint_ranges(self) -> tuple[JointRange, ...]:
@@ -98,8 +103,8 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         return " + ".join(filter(None, [super().torque_name, gradient, motors]))
 
     @property
-    def is_driven(self) -> bool:
-        return super().is_driven or (bool(self.torque_name) and self.torque_arguments is None)
+    def has_torque(self) -> bool:
+        return bool(self.torque_name)
 
     @property
     def needs_attitude(self) -> bool:
@@ -109,22 +114,7 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
     def has_impulse(self) -> bool:
         return self.orbit is not None or super().has_impulse
 
-    def at_time(self, t, attitude=None):
-        system = super().at_time(t, attitude)
-        if not self.torque_name or system.torque_arguments is not None:
-            return system
-        system = copy(system)
-        arguments = jnp.asarray(t, dtype=jnp.float64), None if attitude is None else jnp.asarray(attitude)
-        object.__setattr__(system, "torque_arguments", arguments)
-        return system
-
-    def external_torque(self, x):
-        if not self.torque_name:
-            return None
-        if self.torque_arguments is None or (self.needs_attitude and self.torque_arguments[1] is None):
-            what, arguments = ("time and an attitude", "t, attitude") if self.needs_attitude else ("time", "t")
-            raise InputError(f"the torque {self.torque_name} is known at a {what}: take system.at_time({arguments})")
-        torque, (t, attitude) = super().external_torque(x), self.torque_arguments
+    def _torque_at(self, x, t, attitude):
         k = self.mechanism.n_joints
         on_body, on_joints = jnp.zeros(3), jnp.zeros(k)
         if self.orbit is not None:
@@ -135,14 +125,14 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
             on_body, on_joints = (strength * part for part in self.mechanism.tidal_forces(x[3 : 3 + k], n))
         if self.motors is not None:
             on_joints = on_joints + self.motors(t)
-        forces = jnp.concatenate([on_body, jnp.zeros(k), on_joints, jnp.zeros(self.dim - 3 - 2 * k)])
-        return forces if torque is None else torque + forces
+        forces = jnp.concatenate([on_body, jnp.zeros(k), on_joints])
+        if self.torque is None:
+            return forces
+        return jnp.pad(super()._torque_at(x, t, attitude), (0, 2 * k)) + forces
 
     def drop_torque(self):
-        system = copy(super().drop_torque())
-        for name in ("motors", "orbit", "torque_arguments"):
-            object.__setattr__(system, name, None)
-        return system
+        system = super().drop_torque()
+        return system if system is self else replace_fields(system, motors=None, orbit=None)
 
     @property
     def torque_invariant_casimirs(self) -> frozenset[str]:

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from copy import copy
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from manifolds._pytree_module import replace_fields
 
 from ..integrators import OneStepMethod
 from ..integrators.preserved import casimir_residuals, is_momentum_map, why_not_preserved
@@ -68,10 +69,7 @@ class InvariantFacts(NamedTuple):
 
 def attach_invariant_facts(system: System, facts: InvariantFacts) -> System:
     """Return a copy of the system that has these facts as attributes."""
-    system = copy(system)
-    for name, value in facts._asdict().items():
-        object.__setattr__(system, name, value)
-    return system
+    return replace_fields(system, **facts._asdict())
 
 
 class MemberGroup(NamedTuple):

@@ -13,6 +13,7 @@ import numpy as np
 import manifolds as mf
 from manifolds._arrays import is_traced, real_array
 from manifolds._precision import with_library_settings
+from manifolds._pytree_module import replace_fields
 from manifolds.structures.poisson import ProductPoisson
 
 from ..dissipation.base import Dissipation, sum_dissipations
@@ -131,17 +132,14 @@ class System(SystemInterface):
         if self.baths is None:
             return self
         assert isinstance(self.poisson, ProductPoisson)
-        body = copy(self)
-        attributes = {
-            "dim": self.body_dim,
-            "space": None if self.space is None else _drop_last_factor(self.space),
-            "poisson": self.poisson.first,
-            "energy": self.energy.body if isinstance(self.energy, BodyBathsEnergy) else self.energy,
-            "baths": None,
-        }
-        for name, value in attributes.items():
-            object.__setattr__(body, name, value)
-        return body
+        return replace_fields(
+            self,
+            dim=self.body_dim,
+            space=None if self.space is None else _drop_last_factor(self.space),
+            poisson=self.poisson.first,
+            energy=self.energy.body if isinstance(self.energy, BodyBathsEnergy) else self.energy,
+            baths=None,
+        )
 
     @with_library_settings
     def temperatures(self, x, t=None) -> jax.Array:

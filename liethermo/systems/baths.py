@@ -16,11 +16,11 @@ from manifolds._pytree_module import Module
 from manifolds.structures.poisson import ProductPoisson
 
 from ..errors import InputError
-from ..functions.bath_energy import BathEnergy, DrivenReservoirEnergy, ReservoirEnergy, make_bath_energy
+from ..functions.bath_energy import BathEnergy, DrivenReservoirEnergy, ReservoirEnergy, bath_terms, make_bath_energy
 from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers
 from ..functions.each import Each
-from ..functions.energy import Energy, Pullback, Sum
+from ..functions.energy import Energy, Sum
 from ..tracing.short_form import short_form
 
 
@@ -111,8 +111,9 @@ class HeatBaths(Module):
     @property
     def has_positive_temperatures(self) -> bool:
         """True if the temperatures are positive in every state by construction."""
-        terms = (term.term if isinstance(term, Pullback) else term for term in self.energy.terms)
-        return all(isinstance(term, BathEnergy | ReservoirEnergy | DrivenReservoirEnergy) for term in terms)
+        return all(
+            isinstance(term, BathEnergy | ReservoirEnergy | DrivenReservoirEnergy) for term in bath_terms(self.energy)
+        )
 
     @property
     def scale(self) -> np.ndarray | float:

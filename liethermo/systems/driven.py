@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from copy import copy
 
 import equinox as eqx
 import jax
@@ -11,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds._pytree_module import forward_to
+from manifolds._pytree_module import forward_to, replace_fields
 from manifolds.structures.poisson import PoissonBySharp, ProductPoisson
 
 from ..dissipation.base import SkewFriction
@@ -182,15 +181,11 @@ class DrivenSystem(LiftedSystem):
         """Return the system with its torque evaluated at an attitude, shape (m, m)."""
         if not self.needs_attitude:
             return self
-        bound = copy(self)
-        object.__setattr__(bound, "attitude", attitude)
-        return bound
+        return replace_fields(self, attitude=attitude)
 
     def with_torque(self, torque) -> DrivenSystem:
         """Return the system with a fixed torque, shape (body.dim,)."""
-        bound = copy(self)
-        object.__setattr__(bound, "torque", torque)
-        return bound
+        return replace_fields(self, torque=torque)
 
     can_solve_rotations = forward_to("body")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 from typing import TypeVar
 
 import equinox as eqx
@@ -13,6 +12,7 @@ import numpy as np
 
 from manifolds._arrays import is_traced
 from manifolds._precision import with_library_settings
+from manifolds._pytree_module import replace_fields
 
 from ..functions.energy import Energy, function_name
 from ..tracing.caching import memoize
@@ -145,10 +145,7 @@ def resolve_invariants_near(system: System, states) -> System:
     """
     if system.invariant_verdicts is not None or is_traced(system) or not undecided_functions(system):
         return system
-    resolved = copy(system)
-    verdicts = find_invariants(system, near=np.asarray(states))
-    object.__setattr__(resolved, "invariant_verdicts", verdicts)
-    return resolved
+    return replace_fields(system, invariant_verdicts=find_invariants(system, near=np.asarray(states)))
 
 
 @memoize

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from copy import copy
 
 import equinox as eqx
 import jax
@@ -13,6 +12,7 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced
+from manifolds._pytree_module import replace_fields
 from manifolds.matrices.linear import adjoint
 
 from ..dissipation.adiabatic import ADIABATIC_LIMIT, AdiabaticJumps, adiabatic_parameter
@@ -165,13 +165,10 @@ class QuantumSystem(System):
         """Return the system with its Hamiltonian and its rates frozen at the time t; an attitude plays no part."""
         if not self.is_driven:
             return self
-        frozen = copy(super().at_time(t))
-        object.__setattr__(frozen, "time", jnp.asarray(t, dtype=jnp.float64))
-        return frozen
+        return replace_fields(super().at_time(t), time=jnp.asarray(t, dtype=jnp.float64))
 
     def _trace_dissipation(self, dissipation: Dissipation) -> Dissipation:
-        frozen = copy(self)  # rates are functions of time, which no state contains
-        object.__setattr__(frozen, "time", jnp.zeros(()))
+        frozen = replace_fields(self, time=jnp.zeros(()))  # rates are functions of time, which no state contains
         return super(QuantumSystem, frozen)._trace_dissipation(dissipation)
 
     # -- states -------------------------------------------------------------------------------------------------------

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
-from copy import copy
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._pytree_module import replace_fields
 from manifolds.structures.poisson import ProductPoisson
 from manifolds.structures.spins import add_vectors, cross, cross_vectors, dot_vectors, scale_vectors, split_vectors
 
@@ -329,12 +329,7 @@ def _checked_powers(power, baths: HeatBaths | None) -> tuple[tuple[int, ...], tu
 
 def _drop_power(system: Any) -> Any:
     """Return a system of spins without power for its baths."""
-    if not system.power:
-        return system
-    system = copy(system)
-    for name in ("power", "powered_baths"):
-        object.__setattr__(system, name, ())
-    return system
+    return replace_fields(system, power=(), powered_baths=()) if system.power else system
 
 
 class _DampingParts(NamedTuple):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from abc import abstractmethod
 from collections.abc import Callable
-from copy import copy
 from typing import Any
 
 import jax
@@ -13,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._pytree_module import replace_fields
 
 from ..errors import FunctionError, InputError
 from ..functions.arguments import required_argument_count
@@ -53,18 +53,13 @@ class TorqueSystem(System):
         system = super().at_time(t)
         if not self.has_torque:
             return system
-        system = copy(system)
         arguments = jnp.asarray(t, dtype=jnp.float64), None if attitude is None else jnp.asarray(attitude)
-        object.__setattr__(system, "torque_arguments", arguments)
-        return system
+        return replace_fields(system, torque_arguments=arguments)
 
     def drop_torque(self):
         if not self.has_torque:
             return self
-        system = copy(self)
-        for name in ("torque", "torque_arguments"):
-            object.__setattr__(system, name, None)
-        return system
+        return replace_fields(self, torque=None, torque_arguments=None)
 
     def external_torque(self, x):
         if not self.has_torque:
