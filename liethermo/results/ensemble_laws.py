@@ -91,4 +91,3 @@ def evaluate_ensemble_laws(
         ensemble_law("stage residual", np.where(ensemble.ok, ensemble.residual, 0.0), tolerances.residual)
     )
     return ensemble_laws
-
