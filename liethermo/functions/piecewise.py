@@ -88,7 +88,7 @@ class Table(FunctionWithBreaks):
 
     The interval that contains t is found by bisection, so that the time for a value and for the first answer of a run
     grows with the logarithm of the length of the table. The numbers are parameters. The steps of a run end at the times
-    of a table joined by straight lines, and at the ends of others, unless there are more than 1,000 of them in its span
+    of a table joined by straight lines, and at the ends of others. They do not if the span has more than 1,000 of them,
     or more than steps of a given size.
 
     Parameters
