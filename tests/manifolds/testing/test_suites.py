@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -56,6 +57,20 @@ def test_a_broken_group():
 
     with pytest.raises(testing.PropertyError, match=r"exp x is in the group .*FAILS"):
         testing.check_group(dataclasses.replace(group, name="short", exp_map=truncated_exp))
+
+
+@jax.tree_util.register_static
+class HalfBracketAlgebra(mf.LieAlgebra):
+    """Control: the bracket is half of the commutator."""
+
+    def bracket(self, x, y):
+        return 0.5 * super().bracket(x, y)
+
+
+def test_a_group_with_the_bracket_of_another_algebra():
+    half_algebra = HalfBracketAlgebra(mf.so(3).structure_constants, name="half", basis=mf.so(3).basis)
+    with pytest.raises(testing.PropertyError, match=r"exp u exp v = exp.* FAILS"):
+        testing.check_group(dataclasses.replace(mf.SO(3), name="half", algebra=half_algebra))
 
 
 class MismatchedSphere(mf.Sphere):

@@ -27,7 +27,7 @@ from liethermo import MetriplecticGauss
 from liethermo.engines.solver_options import DEFAULT_OPTIONS
 from liethermo.engines.status_codes import StatusCode
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 needs_compiler = pytest.mark.skipif(native.find_c_compiler() is None, reason="no C compiler")
 
