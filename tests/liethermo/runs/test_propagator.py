@@ -232,7 +232,7 @@ def test_a_run_that_fell_back_is_told_each_time():
 
 
 def test_what_is_conserved_is_found_once_for_each_set_of_parameters(monkeypatch):
-    """A system with new parameters holds arrays that cannot change, so that what was found for it is not found again."""
+    """Systems with new parameters hold arrays that cannot change, so that what was found for one is kept."""
     p = lt.Propagator(lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2), lt.MetriplecticRungeKutta(4), step=0.5)
     tested = []
     find_verdicts = invariants._conservation_verdicts
