@@ -199,7 +199,7 @@ class Propagator:
             if isinstance(self.method, Reference):
                 run.run_with_scipy(bar)
             elif adaptive or until is not None:
-                run.run_with_step_control(bar, step if adaptive else schedule.h, until)
+                run.run_adaptive_or_until_event(bar, step if adaptive else schedule.h, until)
             else:
                 run.run_fixed(bar)
         solution = run.solution()
