@@ -20,7 +20,6 @@ from .array_engine import ArrayEngine, EngineTrajectory
 from .compiled.lanes import CompiledAdaptiveRuns
 from .compiled.step_loop import CompiledEngine, CompiledTrajectory
 from .sparse.engine import SparseEngine
-from .status_codes import StatusCode
 from .step import SavedStates, State
 from .step_control import StepControl
 
