@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from typing import Protocol, TypeVar
 
 import equinox as eqx
 import jax
@@ -11,15 +11,11 @@ import numpy as np
 
 from manifolds._pytree_module import Module
 
+from ..functions.energy import Energy
 from ..functions.time_span import TimeSpan, replace_time_span
-
-if TYPE_CHECKING:
-    from .base import System
 
 WORK_NAME = "work"
 """Name of the work done from outside, an entry of the ledger; the energy of a solution contains it."""
-
-AnySystem = TypeVar("AnySystem", bound="System")
 
 
 class Clock(Module):
@@ -58,6 +54,19 @@ class Clock(Module):
         return jnp.zeros(dim).at[self.index + 1].set(self.unit)
 
 
+class HasClock(Protocol):
+    """A system with an energy, whose states may contain the time and the work."""
+
+    @property
+    def energy(self) -> Energy: ...
+
+    @property
+    def clock(self) -> Clock | None: ...
+
+
+AnySystem = TypeVar("AnySystem", bound=HasClock)
+
+
 def system_of_step(system: AnySystem, x) -> AnySystem:
     """Return the system for a step that starts at x, shape (n,).
 
@@ -79,7 +88,7 @@ def add_jump_of_energy(clock: Clock, x, amount) -> jax.Array:
     return x.at[clock.index + 1].add(jump)
 
 
-def clock_components(system: System, v) -> jax.Array:
+def clock_components(system: HasClock, v) -> jax.Array:
     """Return v, shape (n,), with zeros in all components but those that only count."""
     clock, index = system.clock, np.arange(v.shape[0])
     if clock is None:
@@ -88,7 +97,7 @@ def clock_components(system: System, v) -> jax.Array:
     return jnp.where(is_counter, v, 0.0)
 
 
-def error_of_step(system: System, x, error, mean_slope) -> jax.Array:
+def error_of_step(system: HasClock, x, error, mean_slope) -> jax.Array:
     """Return the error of a step from x, over its size, with the error of the work as one of the state, shape (n,).
 
     A step that is corrected onto the level of the energy less the work moves the state by the error of the work.
