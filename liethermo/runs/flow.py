@@ -34,6 +34,7 @@ from ..errors import InputError
 from ..functions.time_span import DeclaredTimes
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..systems import System
+from ..systems.clock import system_of_step
 from ..tracing.programs import jit_cached, jit_unoptimised
 from .adaptive import Adaptive
 from .flow_derivatives import state_derivatives
@@ -312,7 +313,7 @@ def _recompute_path(system: System, method: OneStepMethod, x, step_sizes, steps:
 
         def step(x, solved_step, h=step_sizes[i]):
             _, compensation, k = solved_step
-            step_system = system.system_of_step(x)
+            step_system = system_of_step(system, x)
             k = _implicit_slopes(step_system, method, x, compensation, h, k)
             return method.move(step_system, x, compensation, h, k)[0], None
 
@@ -355,7 +356,7 @@ def differentiable_step(
 ) -> tuple[jax.Array, ...]:
     """Return the carry after a step that JAX can differentiate; NaN if its equations cannot be solved."""
     x, compensation, k, older_k = carry
-    system = system.system_of_step(x)
+    system = system_of_step(system, x)
     if method.explicit:
         new_k = _slopes_or_nan(explicit_stage_solution(system, method, x, compensation, h, k))
     else:

@@ -17,6 +17,7 @@ from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.surface import Surface
 from .baths import HeatBaths
+from .clock import Clock
 from .conditions import RunCondition
 
 
@@ -240,6 +241,11 @@ class SystemInterface(Geometry):
         """Return the system without its external torque."""
         return self
 
+    @property
+    def clock(self) -> Clock | None:
+        """Components of a state that hold the time and the work, with the span of the run; None if there are none."""
+        return None
+
     # -- spins ----------------------------------------------------------------------------------------------------
 
     @property
@@ -313,11 +319,6 @@ class SystemInterface(Geometry):
     @property
     def constant_names(self) -> tuple[str, ...]:
         """Names of constants of the motion with several components, such as a momentum in space."""
-        return ()
-
-    @property
-    def balance_entries(self) -> tuple[str, ...]:
-        """Entries of the ledger that the energy of a solution contains; laws are stated after subtracting them."""
         return ()
 
     # -- states as users see them -------------------------------------------------------------------------------------
