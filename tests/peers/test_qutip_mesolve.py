@@ -180,6 +180,7 @@ STEPS = {
 }
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", STEPS)
 def test_step_functions_turn_a_qubit_by_half_a_turn(name):
     """The end is ``sigma_x`` times the start, to a fidelity of 1e-6; the jump is at the end of a step."""

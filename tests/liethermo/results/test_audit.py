@@ -356,6 +356,7 @@ def test_the_heat_of_a_wheel_at_rest_is_rounding(method, attitude):
     assert attitude or solution.evidence.inconsistency is None  # nothing moves
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("nutation", [1e-3, 1e-9])
 @pytest.mark.parametrize(
     ("method", "is_consistent"),
@@ -402,7 +403,7 @@ def system_with_drag(name):
     return system, [1.0, 0.0], lambda t, x: np.array([x[1], force(x[0]) - 0.3 * x[1]])
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("step", [0.05, lt.Adaptive(1e-8)], ids=["fixed", "adaptive"])
 @pytest.mark.parametrize(
     "method", [lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4), lt.MetriplecticTaylor(10)], ids=str
@@ -547,9 +548,7 @@ IDLE_SYSTEMS = {
 """Systems whose dissipation does nothing, with initial states."""
 
 
-@pytest.mark.sampled(
-    "jumps without a Hamiltonian-Gauss", "jumps that exchange no heat-Gauss", "a bracket at rate zero-explicit"
-)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method_name", ["Gauss", "explicit"])
 @pytest.mark.parametrize("name", IDLE_SYSTEMS)
 def test_what_rounding_makes_of_nothing_is_no_motion(name, method_name):
