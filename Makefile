@@ -24,7 +24,7 @@ help:
 	@echo "make docs       build the documentation in docs/_build/html"
 	@echo "make docs-check walk the built site in a headless Chromium; screenshots in docs/_build/screenshots"
 	@echo "make wheel      build the wheel in dist/ and try it in a fresh environment"
-	@echo "make bench      measure against C, SciPy, diffrax, heyoka and MuJoCo; writes docs/reference/benchmarks.md and benchmarks/runs.md"
+	@echo "make bench      measure against C, SciPy, diffrax, heyoka and MuJoCo; writes both pages of benchmarks and benchmarks/runs.md"
 	@echo "make format     format the code and repair what the linter can"
 	@echo "make lock       choose new exact versions for all locks (needs Python 3.11)"
 	@echo "make clean      remove .venv and everything built"

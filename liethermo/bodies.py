@@ -15,7 +15,16 @@ from .models.jointed_bodies import JointedBodies
 from .models.joints import Hinge, Slider, Universal
 from .models.tree import Tree
 from .results.attitude_files import AttitudeHistory, read_csv, write_csv
-from .results.orientation import angular_velocity, euler_angles, nutation, precession, quaternions, rotation, spin
+from .results.orientation import (
+    angular_velocity,
+    euler_angles,
+    joint_rates,
+    nutation,
+    precession,
+    quaternions,
+    rotation,
+    spin,
+)
 from .systems.rotations import AttitudeWarning, attitude
 
 __all__ = [
@@ -33,6 +42,7 @@ __all__ = [
     "attitude",
     "damping_time",
     "euler_angles",
+    "joint_rates",
     "nutation",
     "periods",
     "precession",

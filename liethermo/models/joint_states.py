@@ -108,6 +108,10 @@ class TreeSystem(System):
         rates, first = self._motion(x).joint_rates, self.mechanism.first_joint_index
         return {name: _entries(rates, start - first, end - first) for name, start, end in self.joint_ranges}
 
+    def joint_rates_at(self, x):
+        start, k = self.joint_ranges[0][1] + self.mechanism.n_joints, self.mechanism.n_joints
+        return self.energy.gradient(x)[start : start + k]
+
     @with_library_settings
     def _motion(self, x) -> Motion:
         x = self.state(x, batch=True)

@@ -86,7 +86,7 @@ def write_csv(
         raise InputError("a file has one history: write each trajectory of an ensemble, write_csv(path, e[i])")
     quaternion_names = QUATERNION_COLUMNS if scalar == "last" else np.roll(QUATERNION_COLUMNS, 1).tolist()
     names, columns = ["t [s]", *quaternion_names], [np.asarray(solution.t)[:, None], q]
-    if solution.angular_velocity_source is not None:
+    if "angular_velocity" in solution.velocity_sources:
         unit = "deg/s" if degrees else "rad/s"
         names += [f"{name} [{unit}]" for name in RATE_COLUMNS]
         columns.append(angular_velocity(solution, degrees=degrees))

@@ -127,6 +127,10 @@ def merge_evidence(evidence_list: Sequence[Evidence]) -> Evidence:
     return dataclasses.replace(worst, terms=terms, looked=n_checked)
 
 
+VELOCITY_AXES = {"angular_velocity": "axis", "joint_rates": "joint_coordinate"}
+"""Velocities that belong to the states of a result, by name, and the name of their last axis in datasets."""
+
+
 class AuditableResult(SaveableResult):
     """A result with the evidence for its audit, or with the function that computes it."""
 
@@ -139,7 +143,7 @@ class AuditableResult(SaveableResult):
     attitude: np.ndarray | None
     provenance: dict[str, Any]
     evidence_source: Callable[[], Evidence] | None
-    angular_velocity_source: Callable[[], np.ndarray] | None
+    velocity_sources: Mapping[str, Callable[[], np.ndarray]]
 
     @property
     def joints(self) -> dict[str, np.ndarray]:
@@ -148,10 +152,15 @@ class AuditableResult(SaveableResult):
         Each has the shape of the times, (times,), or (times, 2) for a universal joint; in an ensemble trajectories are
         first.
         """
-        if self.x is None:
-            return {}
+        return {} if self.x is None else self.split_by_joint(self.x, 0)
+
+    def split_by_joint(self, values: np.ndarray, first: int) -> dict[str, np.ndarray]:
+        """Return joint coordinates or their rates by the name of the body, from arrays, shape (..., n).
+
+        The values of a joint begin at its index in a state less ``first``.
+        """
         return {
-            name: self.x[..., start] if end - start == 1 else self.x[..., start:end]
+            name: values[..., start - first] if end - start == 1 else values[..., start - first : end - first]
             for name, (start, end) in self.provenance.get("joints", {}).items()
         }
 
@@ -160,12 +169,19 @@ class AuditableResult(SaveableResult):
         """Data that an audit needs besides the series; computed at its first use."""
         return Evidence() if self.evidence_source is None else self.evidence_source()
 
+    def velocities(self) -> dict[str, np.ndarray]:
+        """Return the velocities that belong to the states, by name: of a rigid body, and of joints."""
+        return {name: source() for name, source in self.velocity_sources.items()}
+
     def __getstate__(self) -> dict[str, Any]:  # a pickled copy has the evidence itself, not the function
         fields = {name: getattr(self, name) for name in vars(self)}
         fields |= {"evidence": self.evidence, "evidence_source": None}
-        if self.angular_velocity_source is not None:
-            fields["angular_velocity_source"] = functools.partial(np.copy, self.angular_velocity_source())
-        return fields
+        return fields | {"velocity_sources": copies_of_velocities(self.velocities())}
+
+
+def copies_of_velocities(series: Mapping[str, np.ndarray]) -> dict[str, Callable[[], np.ndarray]]:
+    """Return the functions that copy the velocities among arrays, by name."""
+    return {name: functools.partial(np.copy, series[name]) for name in VELOCITY_AXES if name in series}
 
 
 class StepReplay(Protocol):

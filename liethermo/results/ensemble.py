@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from manifolds._tables import html_grid
 from ..engines.status_codes import STATUS_NAMES, StatusCode
 from ..errors import InputError
 from .audit import FAILED_TRAJECTORIES_ROW, Audit, AuditRow, Tolerances, accuracy_row, coverage_text
-from .audit_evidence import AuditableResult, Evidence, merge_evidence
+from .audit_evidence import VELOCITY_AXES, AuditableResult, Evidence, copies_of_velocities, merge_evidence
 from .ensemble_laws import evaluate_ensemble_laws
 from .events import Events
 from .netcdf import (
@@ -27,7 +28,7 @@ from .netcdf import (
     split_complex,
     state_axis_names,
 )
-from .orientation import array_source, orientation_variables
+from .orientation import orientation_variables
 from .solution import Solution
 from .status import Laws, Stats, Status
 
@@ -153,7 +154,7 @@ class Ensemble(AuditableResult):
     reasons: Mapping[int, str] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
     evidence_source: Callable[[], Evidence] | None = field(default=None, repr=False, compare=False)
-    angular_velocity_source: Callable[[], np.ndarray] | None = field(default=None, repr=False, compare=False)
+    velocity_sources: Mapping[str, Callable[[], np.ndarray]] = field(default_factory=dict, repr=False, compare=False)
     solution_builder: Callable[[Ensemble, int], Solution] | None = field(default=None, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -269,12 +270,14 @@ class Ensemble(AuditableResult):
             event_time=float(self.end_time[i]) if self.status[i] == StatusCode.EVENT else None,
             events=self.events.select_trajectory(i),
             evidence_source=lambda: evidence,
-            angular_velocity_source=self._member_angular_velocity_source(i, is_reached) if has_time_series else None,
+            velocity_sources=self._member_velocity_sources(i, is_reached) if has_time_series else {},
         )
 
-    def _member_angular_velocity_source(self, i: int, is_reached: np.ndarray) -> Callable[[], np.ndarray] | None:
-        source = self.angular_velocity_source
-        return None if source is None else lambda: source()[i][is_reached]
+    def _member_velocity_sources(self, i: int, is_reached: np.ndarray) -> dict[str, Callable[[], np.ndarray]]:
+        def velocities(name: str) -> np.ndarray:
+            return self.velocity_sources[name]()[i][is_reached]
+
+        return {name: partial(velocities, name) for name in self.velocity_sources}
 
     def _initial_entropy(self, i: int) -> float:
         assert self.entropy is not None
@@ -420,7 +423,7 @@ class Ensemble(AuditableResult):
             provenance=provenance,
             events=Events.from_dataset(series),
             evidence_source=lambda: evidence,
-            angular_velocity_source=array_source(series, "angular_velocity"),
+            velocity_sources=copies_of_velocities(series),
         )
 
 
@@ -512,23 +515,20 @@ def join_subsets(subsets: Sequence[Subset], n_trajectories: int, **fields: Any) 
         else lambda: merge_evidence(
             [evidence_source() for evidence_source in evidence_sources if evidence_source is not None]
         ),
-        angular_velocity_source=_join_angular_velocities(subsets, n_trajectories),
+        velocity_sources={
+            name: partial(_join_velocities, name, subsets, n_trajectories)
+            for name in VELOCITY_AXES
+            if all(name in subset.ensemble.velocity_sources for subset in subsets)
+        },
         solution_builder=build_solution,
         **fields,
     )
 
 
-def _join_angular_velocities(subsets: Sequence[Subset], n_trajectories: int) -> Callable[[], np.ndarray] | None:
-    """Return the function that computes the angular velocities of all trajectories; None if the bodies have none."""
-    sources = [(subset.trajectory_numbers, subset.ensemble.angular_velocity_source) for subset in subsets]
-    if any(source is None for _, source in sources):
-        return None
-
-    def compute() -> np.ndarray:
-        parts = [(numbers, source()) for numbers, source in sources if source is not None]
-        joined = np.full((n_trajectories, *parts[0][1].shape[1:]), np.nan)
-        for numbers, values in parts:
-            joined[numbers] = values
-        return joined
-
-    return compute
+def _join_velocities(name: str, subsets: Sequence[Subset], n_trajectories: int) -> np.ndarray:
+    """Return the velocities of a name of all trajectories, shape (n_trajectories, ...)."""
+    parts = [(subset.trajectory_numbers, subset.ensemble.velocity_sources[name]()) for subset in subsets]
+    joined = np.full((n_trajectories, *parts[0][1].shape[1:]), np.nan)
+    for numbers, values in parts:
+        joined[numbers] = values
+    return joined

@@ -64,6 +64,7 @@ LONG_NAMES = {
     "precession": "angle by which that axis has turned about the angular momentum in space",
     "spin": "angle by which the body has turned about that axis",
     "angular_velocity": "angular velocity of the body, in body axes",
+    "joint_rates": "rates of the joint coordinates, in the order of the state",
     "invariant_name": "names of the recorded functions",
     "invariant": "Casimirs, momentum maps, preserved functions and what comes from outside",
 }

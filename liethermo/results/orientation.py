@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 import warnings
-from collections.abc import Callable, Mapping
 from typing import Literal
 
 import numpy as np
@@ -13,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import InputError
 from ..models.inertia import EQUAL_MOMENTS_RTOL
 from ..systems.rotations import check_scalar_place, checked_sequence
-from .audit_evidence import AuditableResult
+from .audit_evidence import VELOCITY_AXES, AuditableResult
 
 ROTATION_GROUPS = ("SO(3)", "SE(3)")
 """Groups whose elements begin with a rotation matrix in their first three rows and columns."""
@@ -146,12 +144,49 @@ def angular_velocity(
         raise InputError(f"frame must be 'body' or 'space', got {frame!r}")
     if solution.x is None:
         raise InputError('no states were kept: run the ensemble with outputs="final" or "trajectory"')
-    if solution.angular_velocity_source is None:
+    if "angular_velocity" not in solution.velocity_sources:
         raise InputError("the result has no angular velocity: its system contains no rigid body on so(3) or se(3)")
-    omega = solution.angular_velocity_source()
+    omega = solution.velocity_sources["angular_velocity"]()
     if frame == "space":
         omega = np.einsum("...ij,...j->...i", _attitudes(solution), omega)
     return np.rad2deg(omega) if degrees else omega
+
+
+def joint_rates(solution: AuditableResult) -> dict[str, np.ndarray]:
+    """Return the rates of the joint coordinates by the name of the body, beside ``solution.joints``.
+
+    Parameters
+    ----------
+    solution : Solution, or Ensemble
+        A result of a tree of jointed bodies, free or on the ground.
+
+    Returns
+    -------
+    dict of ndarray, shape (times,), or (times, 2) of a universal joint; in an ensemble trajectories are first
+        Rates (rad/s, or length / time).
+
+    Raises
+    ------
+    InputError
+        If the system is no tree of jointed bodies, or no states were kept.
+
+    Examples
+    --------
+    >>> tree = lt.bodies.Tree()
+    >>> bus = tree.add("bus", mass=4.0, inertia=(2.0, 2.0, 3.0))
+    >>> wheel = tree.add("wheel", 1.0, inertia=(0.4, 0.4, 0.5), parent=bus, joint=lt.bodies.Hinge((0, 0, 0), (0, 0, 1)))
+    >>> system = tree.system()
+    >>> solution = lt.integrate(system, system.state(joint_rates={"wheel": 0.2}), (0.0, 1.0), 0.5)
+    >>> lt.bodies.joint_rates(solution)["wheel"].round(12).tolist()
+    [0.2, 0.2, 0.2]
+    """
+    if solution.x is None:
+        raise InputError('no states were kept: run the ensemble with outputs="final" or "trajectory"')
+    if "joint_rates" not in solution.velocity_sources:
+        raise InputError("the result has no joint rates: its system is no tree of jointed bodies")
+    rates = solution.velocity_sources["joint_rates"]()
+    first = min(start for start, _ in solution.provenance["joints"].values())
+    return solution.split_by_joint(rates, first)
 
 
 def nutation(solution: AuditableResult, axis=None) -> np.ndarray:
@@ -239,7 +274,7 @@ def precession(solution: AuditableResult, axis=None) -> np.ndarray:
 
 
 def orientation_variables(solution: AuditableResult, dims: tuple[str, ...]) -> dict[str, tuple]:
-    """Return the variables of a dataset that describe the orientation of a body, and its angular velocity.
+    """Return the variables of a dataset that describe the orientation of a body, and velocities of body and joints.
 
     Parameters
     ----------
@@ -250,14 +285,8 @@ def orientation_variables(solution: AuditableResult, dims: tuple[str, ...]) -> d
         name: ((*dims, "quaternion_component")[: values.ndim], values)
         for name, values in orientation_series(solution).items()
     }
-    if solution.angular_velocity_source is not None and solution.x is not None:
-        variables["angular_velocity"] = ((*dims, "axis"), solution.angular_velocity_source())
-    return variables
-
-
-def array_source(series: Mapping[str, np.ndarray], name: str) -> Callable[[], np.ndarray] | None:
-    """Return the function that copies an array of a dataset; None if the dataset has none of this name."""
-    return functools.partial(np.copy, series[name]) if name in series else None
+    velocities = {} if solution.x is None else solution.velocities()
+    return variables | {name: ((*dims, VELOCITY_AXES[name]), values) for name, values in velocities.items()}
 
 
 def orientation_series(solution: AuditableResult) -> dict[str, np.ndarray]:

@@ -14,7 +14,7 @@ from manifolds._tables import html_grid
 
 from ..errors import InputError
 from .audit import Audit, Tolerances, audit_run
-from .audit_evidence import AuditableResult, Evidence
+from .audit_evidence import AuditableResult, Evidence, copies_of_velocities
 from .events import Events
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ from .netcdf import (
     split_complex,
     state_axis_names,
 )
-from .orientation import array_source, orientation_variables
+from .orientation import orientation_variables
 from .sketch import svg_sketch
 from .status import Laws, Stats, Status
 
@@ -137,7 +137,7 @@ class Solution(AuditableResult):
     dense: DenseOutput | None = None
     attitude: np.ndarray | None = None
     evidence_source: Callable[[], Evidence] | None = field(default=None, repr=False, compare=False)
-    angular_velocity_source: Callable[[], np.ndarray] | None = field(default=None, repr=False, compare=False)
+    velocity_sources: Mapping[str, Callable[[], np.ndarray]] = field(default_factory=dict, repr=False, compare=False)
 
     @with_library_settings
     def __call__(self, t) -> np.ndarray:
@@ -277,5 +277,5 @@ class Solution(AuditableResult):
             events=Events.from_dataset(series),
             attitude=attitude,
             evidence_source=lambda: evidence,
-            angular_velocity_source=array_source(series, "angular_velocity"),
+            velocity_sources=copies_of_velocities(series),
         )

@@ -31,7 +31,7 @@ from ..engines.step import (
     stage_equations,
 )
 from ..errors import InputError
-from ..functions.time_span import declared_breaks
+from ..functions.time_span import DeclaredTimes
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..systems import System
 from ..tracing.programs import jit_cached, jit_unoptimised
@@ -123,8 +123,8 @@ def flow(
     if save_at is not None and save_every is not None:
         raise InputError("flow takes save_at or save_every, got both. Remove one of them")
     save_every = 1 if save_at is not None else save_every
-    x, declared = system.state(x0), declared_breaks(system)
-    schedule = make_schedule(t_span, step, save_every, breaks=breaks, declared_breaks=declared)
+    x, declared = system.state(x0), DeclaredTimes.of_tree(system)
+    schedule = make_schedule(t_span, step, save_every, breaks=breaks, declared=declared)
     times = None if save_at is None else checked_save_times(save_at, schedule)
     n, user_system = system.dim, system
     system, method = prepare_for_method(system, method, None, attitude is not None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -36,7 +37,7 @@ from ..systems.states import reshape_to_sites
 from ..tracing.interpret import evaluate_at_points
 from .preparation import invariants_and_laws
 from .schedule import StepSchedule
-from .solution_builder import EngineReplay, RecordedFunctions, angular_velocities, build_solution
+from .solution_builder import EngineReplay, RecordedFunctions, build_solution, velocities_at_states, velocity_names
 from .system_family import Family
 from .termination import ensemble_failure_message
 
@@ -237,21 +238,23 @@ class EnsembleRecord:
             attitude=attitude,
             attitude0=attitude0,
             work=work,
-            angular_velocity_source=self._angular_velocity_source(),
+            velocity_sources=self._velocity_sources(),
             **quantities,
             **fields,
         )
         return reshape_to_sites(self.member, result)
 
-    def _angular_velocity_source(self) -> Callable[[], np.ndarray] | None:
-        """Return the function that computes the angular velocities, trajectories first; None without a rigid body."""
+    def _velocity_sources(self) -> dict[str, Callable[[], np.ndarray]]:
+        """Return the functions that compute the velocities, trajectories first, by their names."""
         x = self.x if self.trajectories is None else self.trajectories[..., :-2]
-        return None if x is None or not self.member.has_angular_velocity else lambda: self._angular_velocities(x)
+        if x is None:
+            return {}
+        return {name: functools.partial(self._velocities, name, x) for name in velocity_names(self.member)}
 
-    def _angular_velocities(self, x: np.ndarray) -> np.ndarray:
+    def _velocities(self, name: str, x: np.ndarray) -> np.ndarray:
         if not any(self.family.has_member_axis):
-            return angular_velocities(self.member, x)
-        return np.stack([angular_velocities(self.family.member(i), states) for i, states in enumerate(x)])
+            return velocities_at_states(name, self.member, x)
+        return np.stack([velocities_at_states(name, self.family.member(i), states) for i, states in enumerate(x)])
 
 
 class MemberSolutionBuilder:

@@ -36,21 +36,21 @@ class RecordedFunctions(NamedTuple):
         These and the entries of the ledger, whose values along a run belong to its solution.
     has_user_states : bool
         Whether states of a run have the form that the user sees.
-    has_angular_velocity : bool
-        Whether the system contains a rigid body.
+    velocity_names : tuple of str
+        Names in :data:`VELOCITY_FUNCTIONS` of the velocities that the system has.
     """
 
     invariants: dict[str, Energy]
     of_series: dict[str, Energy]
     has_user_states: bool
-    has_angular_velocity: bool
+    velocity_names: tuple[str, ...]
 
     @classmethod
     def from_system(cls, system: System, invariants: Mapping[str, tuple[Energy, bool | None]]) -> RecordedFunctions:
         """Return the recorded functions, with invariants as :func:`.preparation.invariants_and_laws` returns them."""
         functions = {name: f for name, (f, _) in invariants.items()}
         has_user_states = type(system).to_user_solution is System.to_user_solution and not system.sites
-        return cls(functions, {**functions, **system.ledger}, has_user_states, system.has_angular_velocity)
+        return cls(functions, {**functions, **system.ledger}, has_user_states, velocity_names(system))
 
 
 def build_solution(
@@ -84,22 +84,39 @@ def build_solution(
         evidence_source=EvidenceCollector(
             system, method, functions.invariants, x, np.asarray(fields["t"]), step_sizes, replay
         ),
-        angular_velocity_source=functools.partial(angular_velocities, system, x)
-        if functions.has_angular_velocity
-        else None,
+        velocity_sources={
+            name: functools.partial(velocities_at_states, name, system, x) for name in functions.velocity_names
+        },
         **fields,
     )
     return solution if functions.has_user_states else system.to_user_solution(solution)
 
 
-def angular_velocities(system: System, x: np.ndarray) -> np.ndarray:
-    """Return the angular velocities of a rigid body in body axes at states of a prepared system, shape (..., 3)."""
+def velocity_names(system: System) -> tuple[str, ...]:
+    """Return the names in :data:`VELOCITY_FUNCTIONS` of the velocities that a system has."""
+    has_velocity = {"angular_velocity": system.has_angular_velocity, "joint_rates": bool(system.joint_ranges)}
+    return tuple(name for name in VELOCITY_FUNCTIONS if has_velocity[name])
+
+
+def velocities_at_states(name: str, system: System, x: np.ndarray) -> np.ndarray:
+    """Return the velocities of a name at states of a prepared system, shape (..., n); they have the shape (..., k)."""
     rows = np.asarray(x).reshape(-1, x.shape[-1])
-    return np.asarray(evaluate_at_points(_angular_velocity, system, rows)).reshape(*x.shape[:-1], 3)
+    return np.asarray(evaluate_at_points(VELOCITY_FUNCTIONS[name], system, rows)).reshape(*x.shape[:-1], -1)
 
 
 def _angular_velocity(system: System, x):
     return system.angular_velocity_at(x)
+
+
+def _joint_rates(system: System, x):
+    return system.joint_rates_at(x)
+
+
+VELOCITY_FUNCTIONS: dict[str, Callable[[System, Any], Any]] = {
+    "angular_velocity": _angular_velocity,
+    "joint_rates": _joint_rates,
+}
+"""Functions of a system and a state, shape (n,), to velocities, shape (k,), by the name of the result."""
 
 
 def _series_of_functions(functions: Mapping[str, Energy], x: np.ndarray) -> dict[str, np.ndarray]:

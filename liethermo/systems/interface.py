@@ -89,6 +89,10 @@ class SystemInterface(Geometry):
         """Return the angular velocity of the rigid body in body axes, shape (3,), at a state x, shape (n,)."""
         raise InputError("the system contains no rigid body, so it has no angular velocity")
 
+    def joint_rates_at(self, x) -> jax.Array:
+        """Return the rates of the joint coordinates, shape (k,), in the order of :attr:`joint_ranges`, at a state x."""
+        raise InputError("the system is no tree of jointed bodies, so it has no joint rates")
+
     @property
     def inner(self) -> SystemInterface | None:
         """The system whose states begin those of this one, and whose functions are conserved; None without one."""

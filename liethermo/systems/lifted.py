@@ -72,6 +72,9 @@ class LiftedSystem(System):
     def angular_velocity_at(self, x):
         return self.inner_at(x).angular_velocity_at(x[: self.inner.dim])
 
+    def joint_rates_at(self, x):
+        return self.inner_at(x).joint_rates_at(x[: self.inner.dim])
+
     def momentum_scale(self, x) -> jax.Array:
         return self.inner.momentum_scale(x[: self.inner.dim])
 

@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
+from liethermo.integrators import InCharts
 from liethermo.runs.preparation import prepare_system_and_method
 from tests.manifolds.spaces.test_own_spaces import Ellipsoid
 
@@ -116,7 +117,7 @@ def test_the_embedded_system_runs_unless_a_retraction_is_given():
     assert method == GAUSS
     chart_run = prepare_system_and_method(spin, lt.MetriplecticGauss(2, retraction="exp"))
     assert chart_run[0] is spin
-    assert isinstance(chart_run[1], lt.InCharts)
+    assert isinstance(chart_run[1], InCharts)
 
     def tensor(x):
         a, b, c = x

@@ -246,9 +246,9 @@ def test_friction_inside_keeps_the_momentum_in_space(name, method):
 MATRIX_GROUPS = [mf.SO(2), mf.SO(3), mf.SO(4), mf.SO(5), mf.SE(2), mf.SE(3), mf.SU(2), mf.SU(3), mf.SL(2)]
 MATRIX_GROUPS += [mf.Sp(1), mf.Sp(2), mf.GL(2), mf.Heisenberg(1), mf.Heisenberg(2)]
 ADJOINT_GROUPS = {"SO(2)", "SO(3)", "SO(4)", "SE(2)", "SE(3)", "SU(2)", "SL(2)", "Sp(1)", "GL(2)", "Heisenberg(1)"}
-"""Groups in which the end of collocation is an adjoint action: see :class:`liethermo.WithAttitude`."""
+"""Groups in which the end of collocation is an adjoint action: see :class:`~liethermo.integrators.WithAttitude`."""
 ADJOINT_GROUPS |= {"Heisenberg(2)"}
-"""Groups in which the end of collocation is an adjoint action: see :class:`liethermo.WithAttitude`."""
+"""Groups in which the end of collocation is an adjoint action: see :class:`~liethermo.integrators.WithAttitude`."""
 
 
 @pytest.mark.sampled("SO(3)")

@@ -118,6 +118,29 @@ def test_joints_and_velocities_of_solutions_and_files(system, x0, tmp_path):
     np.testing.assert_allclose(lt.bodies.angular_velocity(solution)[0], ANGULAR_VELOCITY, atol=1e-14)
     rates = system.joint_rates(x0)
     assert {name: float(rate) for name, rate in rates.items()} == pytest.approx(RATES)
+    for run in (solution, loaded):
+        rates = lt.bodies.joint_rates(run)
+        assert {name: float(series[0]) for name, series in rates.items()} == pytest.approx(RATES)
+        np.testing.assert_allclose(rates["tip"], system.joint_rates(solution.x)["tip"], atol=1e-13)
+    dataset = solution.to_xarray()
+    assert dataset["joint_rates"].dims == ("time", "joint_coordinate")
+
+
+def test_joint_rates_are_derivatives_of_the_joints(system, x0):
+    h = 1e-3
+    many = lt.ensemble(system, [x0, x0], (0.0, 10 * h), h, lt.MetriplecticGauss(2), outputs="trajectory")
+    rates = lt.bodies.joint_rates(many)
+    for name, angles in many.joints.items():
+        assert rates[name].shape == angles.shape
+        slopes = (angles[..., :-4] - 8 * angles[..., 1:-3] + 8 * angles[..., 3:-1] - angles[..., 4:]) / (12 * h)
+        np.testing.assert_allclose(rates[name][..., 2:-2], slopes, atol=1e-9)
+    np.testing.assert_array_equal(lt.bodies.joint_rates(many[1])["tip"], rates["tip"][1])
+
+
+def test_a_rigid_body_has_no_joint_rates():
+    run = lt.integrate(lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2), [0.1, 0.2, 1.0], (0.0, 1.0), 0.1)
+    with pytest.raises(lt.InputError, match="no tree"):
+        lt.bodies.joint_rates(run)
 
 
 # -- closed forms ---------------------------------------------------------------------------------------------------
