@@ -140,7 +140,7 @@ def forced_system():
     )
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled("LieVariational", "MetriplecticGauss(stages=2)")
 @pytest.mark.parametrize(
     ("method", "order"),
     [

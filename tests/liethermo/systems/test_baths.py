@@ -6,6 +6,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import liethermo as lt
+from tests.refusals import refusal_test
 
 FIELD = 1.2
 RATE = 0.3
@@ -120,8 +121,4 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_bad_baths_are_refused(name):
-    attempt, says = BAD[name]
-    with pytest.raises((lt.InputError, lt.FunctionError), match=says):
-        attempt()
+test_bad_baths_are_refused = refusal_test(BAD, error=(lt.InputError, lt.FunctionError))
