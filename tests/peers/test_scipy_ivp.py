@@ -75,7 +75,7 @@ def crossing_2(t, y):
     return (t * y[1]) ** 0.6 - y[0]
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_integration(method):
     """test_integration, forwards: errors at the steps, at 50 times and at one time, within five tolerances."""

@@ -379,6 +379,7 @@ def test_an_event_that_never_happens():
     assert solution.t[-1] == 10.0
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-3)], ids=["fixed", "adaptive"])
 @pytest.mark.parametrize(
     "until",

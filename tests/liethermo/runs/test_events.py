@@ -141,7 +141,7 @@ ZEROS = {
 }
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("name", ZEROS)
 @pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-8)])

@@ -147,6 +147,7 @@ def test_no_smaller_step_is_advised_where_none_helps(monkeypatch):
     assert "do not help" in solution.status.message
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("x0", [[1.0, 20.0, 0.1], [5.0, 100.0, 5.0]])
 @pytest.mark.parametrize("h", [1.0, 20.0, 50.0, 1e3])
 def test_huge_steps_solve_their_equation(h, x0):

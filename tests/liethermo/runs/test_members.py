@@ -84,6 +84,7 @@ def test_members_with_attitudes_and_with_work(outputs):
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("outputs", ["final", "trajectory", "summary"])
 def test_save_and_load(tmp_path, outputs):
     x0s = states(5)

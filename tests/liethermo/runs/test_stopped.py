@@ -18,6 +18,7 @@ BODY = lt.models.rigid_body()
 X0 = np.array([0.1, 1.0, 0.1])
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("error", "why"),
     [

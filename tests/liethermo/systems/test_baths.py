@@ -26,6 +26,7 @@ def motion(t, u):
     return [*(torque + RATE * np.cross(s, torque)), heat / (1.0 + 0.5 * np.sin(t)), u[3] * 0.5 * np.cos(t)]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4)])
 def test_a_bath_with_a_given_temperature_does_its_work(method):
     reference = solve_ivp(motion, (0.0, 6.0), [*START, 0.0, 0.0], rtol=1e-11, atol=1e-12).y[:, -1]
