@@ -121,6 +121,11 @@ def test_a_constant_does_not_hide_a_drift():
     assert drifting_solution.audit().energy_drift == pytest.approx(
         1e-14, rel=0.1
     )  # relative to the value by definition
+    drift_between_saves = dataclasses.replace(
+        solution.stats, energy_range=(solution.energy[0], solution.energy[0] + 1e-4)
+    )
+    unsaved_drift = dataclasses.replace(solution, stats=drift_between_saves)
+    assert only_row(unsaved_drift.audit(), "energy drift").passed is False
     falling_entropy = dataclasses.replace(
         solution, entropy=1e12 - 4e-4 * np.arange(len(solution.t))
     )  # each decrease is as small as rounding
