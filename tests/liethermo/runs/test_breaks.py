@@ -69,6 +69,7 @@ def body_with_undeclared_pulses():
     return lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1.0 / INERTIA), torque=undeclared_pulses)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("method", "step", "max_error"), METHODS, ids=str)
 def test_thruster_pulses_are_integrated_to_the_tolerance(body, reference, method, step, max_error):
     solution = lt.integrate(body, X0, (0.0, END), step, method)
@@ -150,6 +151,7 @@ def switched_reference():
     return m, work
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("is_right_continuous", [True, False])
 @pytest.mark.parametrize(
     ("method", "step", "max_error"),
@@ -249,6 +251,7 @@ def test_smooth_drives_have_no_features():
 # -- errors of quadratures ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("frequency", [1.0, 10.0])
 @pytest.mark.parametrize(
     "method", [*map(lt.MetriplecticRungeKutta, (4, 6, 8)), lt.MetriplecticTaylor(), lt.MetriplecticGauss(3)], ids=str
