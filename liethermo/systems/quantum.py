@@ -156,7 +156,7 @@ class QuantumSystem(System):
 
     @property
     def is_driven(self) -> bool:
-        """True if the Hamiltonian or a rate depends on time."""
+        """True if the Hamiltonian, a rate or a jump operator depends on time."""
         return super().is_driven or (
             self.time is None and self.dissipation is not None and self.dissipation.depends_on_time
         )
