@@ -64,7 +64,7 @@ class Series:
     @property
     def autocorrelation_time(self) -> float:
         """The integrated autocorrelation time of m², in rows, with a window of six times its value [Sokal 1997]."""
-        return integrated_autocorrelation(self.squared_magnetisation)
+        return lt.magnetism.autocorrelation_time(self.squared_magnetisation)
 
     @property
     def row_indices(self) -> np.ndarray:
@@ -76,7 +76,7 @@ class Series:
         half."""
         n = len(self.samples)
         n_skipped = max(
-            n // 20, min(n // 2, int(8 * integrated_autocorrelation(self.squared_magnetisation[n // 10 :])))
+            n // 20, min(n // 2, int(8 * lt.magnetism.autocorrelation_time(self.squared_magnetisation[n // 10 :])))
         )
         return replace(self, samples=self.samples[n_skipped:])
 
@@ -86,30 +86,12 @@ class Series:
         return np.array_split(self.row_indices, count)
 
 
-def integrated_autocorrelation(x: np.ndarray) -> float:
-    x = x - x.mean()
-    spectrum = np.fft.rfft(x, 2 * len(x))
-    correlation = np.fft.irfft(spectrum * spectrum.conj())[: len(x)]
-    total = 0.5
-    for lag, value in enumerate(correlation[1:] / correlation[0], start=1):
-        total += value
-        if lag > 6 * total:
-            break
-    return float(total)
-
-
 def magnetisation(series: Series, rows) -> float:
     return float(np.sqrt(series.squared_magnetisation[rows]).mean())
 
 
 def specific_heat(series: Series, rows) -> float:
     return float(series.energy[rows].var() * series.length**3 / series.temperature**2)
-
-
-def binder_cumulant(series: Series, rows) -> float:
-    """Return Binder's cumulant ``1 - <m^4> / 3 <m^2>^2``."""
-    square = series.squared_magnetisation[rows]
-    return float(1.0 - (square**2).mean() / (3.0 * square.mean() ** 2))
 
 
 def with_error(quantity, series: Series) -> tuple[float, float]:
@@ -123,30 +105,6 @@ def jackknife_variance(quantity, series: Series) -> float:
     """Return the jackknife variance of a function of row indices."""
     estimates = [quantity(np.delete(series.row_indices, block)) for block in series.jackknife_blocks()]
     return float((len(estimates) - 1) * np.var(estimates))
-
-
-def cumulant_slope(series: Series, rows) -> float:
-    """Return the temperature derivative of the cumulant, from correlations of m² and m⁴ with the energy."""
-    energy, square = series.energy[rows] * series.length**3, series.squared_magnetisation[rows]
-    second, fourth = square.mean(), (square**2).mean()
-    changes = [((x - x.mean()) * energy).mean() / series.temperature**2 for x in (square, square**2)]
-    return float((2.0 * fourth * changes[0] / second - changes[1]) / (3.0 * second**2))
-
-
-def cumulant_crossing(a: Series, b: Series) -> tuple[float, float]:
-    """Return the temperature at which the cumulants of two lattices are equal, and its standard error.
-
-    Both runs have one temperature; each cumulant is extrapolated linearly from there.
-    """
-    temperature = a.temperature
-
-    def crossing(rows_a, rows_b) -> float:
-        difference = binder_cumulant(a, rows_a) - binder_cumulant(b, rows_b)
-        return temperature - difference / (cumulant_slope(a, rows_a) - cumulant_slope(b, rows_b))
-
-    variance_a = jackknife_variance(lambda of_a: crossing(of_a, b.row_indices), a)
-    variance_b = jackknife_variance(lambda of_b: crossing(a.row_indices, of_b), b)
-    return crossing(a.row_indices, b.row_indices), float(np.sqrt(variance_a + variance_b))
 
 
 def join_runs(runs: list[Series]) -> Series:
