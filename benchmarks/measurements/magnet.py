@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import liethermo as lt
+from liethermo.functions.magnetism.transitions import autocorrelation_time
 
 from ..heat_bath import sample_heat_bath
 from ..report import Report, Table, Target
@@ -58,13 +59,22 @@ class Series:
         return self.samples[:, 0]
 
     @property
+    def magnetisation_vectors(self) -> np.ndarray:
+        return self.samples[:, 1:]
+
+    @property
     def squared_magnetisation(self) -> np.ndarray:
-        return (self.samples[:, 1:] ** 2).sum(axis=1)
+        return (self.magnetisation_vectors**2).sum(axis=1)
+
+    def magnet_samples(self) -> lt.magnetism.MagnetSamples:
+        """Return the samples with the energy of all spins."""
+        energy = self.energy * self.length**3
+        return lt.magnetism.MagnetSamples(self.temperature, energy, self.magnetisation_vectors)
 
     @property
     def autocorrelation_time(self) -> float:
         """The integrated autocorrelation time of m², in rows, with a window of six times its value [Sokal 1997]."""
-        return lt.magnetism.autocorrelation_time(self.squared_magnetisation)
+        return autocorrelation_time(self.squared_magnetisation)
 
     @property
     def row_indices(self) -> np.ndarray:
@@ -75,9 +85,7 @@ class Series:
         """Return the series without its beginning: a twentieth, or eight autocorrelation times if that is at most
         half."""
         n = len(self.samples)
-        n_skipped = max(
-            n // 20, min(n // 2, int(8 * lt.magnetism.autocorrelation_time(self.squared_magnetisation[n // 10 :])))
-        )
+        n_skipped = max(n // 20, min(n // 2, int(8 * autocorrelation_time(self.squared_magnetisation[n // 10 :]))))
         return replace(self, samples=self.samples[n_skipped:])
 
     def jackknife_blocks(self) -> list[np.ndarray]:
@@ -166,7 +174,8 @@ def run(is_quick: bool) -> Report:
 
 def series_row(series: Series) -> list:
     """Return a row of the table: the results of a series with their standard errors."""
-    quantities = [with_error(f, series) for f in (magnetisation, specific_heat, binder_cumulant)]
+    quantities = [with_error(f, series) for f in (magnetisation, specific_heat)]
+    quantities.append(tuple(lt.magnetism.binder_cumulant(series.magnetisation_vectors)))
     times = series.autocorrelation_time * series.steps_per_row
     return [series.generator, series.length, f"{series.temperature:g}", series.steps, times, *sum(quantities, ())]
 
@@ -175,7 +184,8 @@ def crossing_rows(series_list: list[Series]) -> list[list]:
     """Return for each pair of lattices the crossing, its error, the number of blocks, and the relative deviation."""
     rows = []
     for a, b in itertools.combinations(sorted(series_list, key=lambda series: series.length), 2):
-        (T, error), blocks = cumulant_crossing(a, b), min(len(series.jackknife_blocks()) for series in (a, b))
+        T, error = lt.magnetism.cumulant_crossing(a.magnet_samples(), b.magnet_samples())
+        blocks = min(len(series.jackknife_blocks()) for series in (a, b))
         rows.append([f"{a.length}³ and {b.length}³", T, error, blocks, abs(T / CRITICAL_TEMPERATURE - 1.0)])
     return rows
 
