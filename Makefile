@@ -24,7 +24,7 @@ help:
 	@echo "make docs       build the documentation in docs/_build/html"
 	@echo "make docs-check walk the built site in a headless Chromium; screenshots in docs/_build/screenshots"
 	@echo "make wheel      build the wheel in dist/ and try it in a fresh environment"
-	@echo "make bench      measure against C, SciPy, diffrax, heyoka and MuJoCo; writes docs/reference/benchmarks.md and benchmarks/runs.md"
+	@echo "make bench      measure against C, SciPy, diffrax, heyoka and MuJoCo; writes both pages of benchmarks and benchmarks/runs.md"
 	@echo "make format     format the code and repair what the linter can"
 	@echo "make lock       choose new exact versions for all locks (needs Python 3.11)"
 	@echo "make clean      remove .venv and everything built"
@@ -57,7 +57,7 @@ demo: .venv
 	$(BIN)/liethermo run examples/tumbling_body.toml --out demo_output
 
 # pytest keeps the tests as it has rewritten them, where Python is told to keep nothing too.
-test test-slow: export PYTHONDONTWRITEBYTECODE :=
+test test-slow docs-check bench: export PYTHONDONTWRITEBYTECODE :=
 
 test: .venv/test
 	$(BIN)/ruff check .
@@ -77,7 +77,8 @@ fuzz: .venv/test
 docs: .venv/docs
 	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html
 
-docs-check: docs
+docs-check: docs .venv/test
+	$(BIN)/python -m pytest -m "slow or not slow" tests/site
 	$(BIN)/python docs/check_site.py
 
 # Installed with what it needs and nothing else, and run away from the sources.
@@ -91,7 +92,8 @@ wheel: .venv
 	venv/bin/liethermo --version; \
 	venv/bin/liethermo run relaxed_rigid_body.toml --out out
 
-bench: .venv/bench
+bench: .venv/bench .venv/test
+	$(BIN)/python -m pytest -m "slow or not slow" tests/benchmarks
 	$(BIN)/python -m benchmarks --page docs/reference/benchmarks.md
 
 format: .venv/test

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -10,10 +11,16 @@ import numpy as np
 from .first_page import PeerComparison
 from .report import Table
 
-FASTER_COLOUR = "#0072b2"
-"""Colour of tasks in which this library is faster."""
-SLOWER_COLOUR = "#d55e00"
-"""Colour of tasks in which this library is slower."""
+PEER_MARKERS = {
+    "C": ("o", "#000000"),
+    "heyoka": ("s", "#d55e00"),
+    "diffrax": ("^", "#0072b2"),
+    "SciPy": ("v", "#56b4e9"),
+    "MuJoCo": ("D", "#009e73"),
+    "Basilisk": ("P", "#cc79a7"),
+    "isospectral": ("X", "#e69f00"),
+}
+"""Marker and colour of each program by the beginning of its name."""
 
 LINE_STYLES = {", compiled engine": "-", ", array engine": "--", ", C": ":"}
 """Line style by the suffix that names the engine; the colour stands for the method."""
@@ -46,29 +53,44 @@ def draw_work_precision(series: dict[str, list[list[float]]], path: Path) -> Non
 
 
 def draw_time_ratios(themes: dict[str, list[PeerComparison]], path: Path) -> None:
-    """Draw the ratio of times, one bar per task, grouped by theme; bars to the left of 1 mean that this library is
-    faster."""
+    """Draw the ratios of times, one line per task with a marker for each program, narrow enough for a telephone.
+
+    Points left of 1 mean that this library is faster.
+    """
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    rows = [(theme, c) for theme, comparisons in themes.items() for c in comparisons]
-    with matplotlib.rc_context({"svg.hashsalt": "liethermo", "svg.fonttype": "none", "font.size": 8}):
-        figure, axes = plt.subplots(figsize=(8.0, 0.6 + 0.19 * len(rows)), layout="constrained")
-        for i, (_, c) in enumerate(rows):
-            axes.barh(i, c.ratio - 1.0, left=1.0, height=0.7, color=FASTER_COLOUR if c.ratio < 1.0 else SLOWER_COLOUR)
-        axes.set_yticks(range(len(rows)), [f"{c.work} · {c.peer.split(',')[0]}" for _, c in rows])
-        axes.set_xscale("log")
-        axes.axvline(1.0, color="black", linewidth=0.8)
-        axes.invert_yaxis()
-        ends = [i for i in range(1, len(rows)) if rows[i][0] != rows[i - 1][0]]
-        for end in ends:
-            axes.axhline(end - 0.5, color="black", linewidth=0.3, alpha=0.5)
-        axes.set_xlabel("time here / time there")
-        axes.grid(True, axis="x", which="major", linewidth=0.4, alpha=0.5)
-        axes.set_axisbelow(True)
-        axes.margins(y=0.01)
+    tasks_by_theme = {theme: list(dict.fromkeys(c.work for c in found)) for theme, found in themes.items()}
+    n_lines = sum(len(tasks) + 1 for tasks in tasks_by_theme.values())
+    with matplotlib.rc_context({"svg.hashsalt": "liethermo", "svg.fonttype": "none", "font.size": 9}):
+        figure, axes = plt.subplots(figsize=(4.2, 1.0 + 0.33 * n_lines), layout="constrained")
+        label_place: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "va": "center", "fontsize": 9}
+        height, labelled = 0.0, set()
+        for theme, comparisons in themes.items():
+            axes.text(0.0, height, theme, weight="bold", **label_place)
+            for task in tasks_by_theme[theme]:
+                height += 1.0
+                axes.text(0.0, height - 0.28, task, **label_place)
+                axes.axhline(height + 0.2, color="0.85", linewidth=0.6, zorder=0)
+                for c in (c for c in comparisons if c.work == task):
+                    peer = next(start for start in PEER_MARKERS if c.peer.startswith(start))
+                    marker, colour = PEER_MARKERS[peer]
+                    label = None if peer in labelled else peer
+                    axes.plot(c.ratio, height + 0.2, marker, color=colour, markersize=6, label=label)
+                    labelled.add(peer)
+            height += 1.1
+        ratios = [c.ratio for comparisons in themes.values() for c in comparisons]
+        limits = min(ratios) / 1.5, 1.5 * max(ratios)
+        axes.set(xscale="log", xlim=limits, ylim=(height - 0.4, -0.6))
+        axes.set_xlabel(
+            "← liethermo is faster   ·   the other is faster →\ntime of liethermo / time of the other program"
+        )
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.axvline(1.0, color="black", linewidth=0.8, zorder=1)
+        axes.axvspan(limits[0], 1.0, color="0.96", zorder=-1)
+        axes.set_yticks([])
         axes.spines[["top", "right", "left"]].set_visible(False)
-        axes.tick_params(axis="y", length=0)
+        figure.legend(frameon=False, loc="outside upper left", ncols=4, handletextpad=0.0, columnspacing=0.8)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, metadata={"Date": None})
         plt.close(figure)

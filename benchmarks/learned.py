@@ -24,18 +24,6 @@ LONG_RUN_FACTOR = 100
 """Duration of the run in which the laws are followed, in durations of the data."""
 
 
-REPORT_TEXT = (
-    "Errors of forecasts from the first states of trajectories that were not learned from, means over all "
-    f"components and times. The laws are those of one forecast over {LONG_RUN_FACTOR} times the time of the data, "
-    "of the "
-    "energy and entropy that were learned. GFINN and NMS are written here from their papers. All have the same data, "
-    "loss, descent, rate, batches and networks. Their forecasts run by RK4, ours by a method of the same order with "
-    "discrete laws. What rate and loss `lt.learn` has was chosen on other trajectories than these. Figures that the "
-    "authors publish are not quoted: their tables could not be looked up."
-)
-"""Description that both reports share."""
-
-
 class Problem(NamedTuple):
     """Data of a motion, made by SciPy at a tolerance of 1e-10, and prior knowledge of it."""
 
@@ -75,10 +63,10 @@ def _pendulum_field(t, x):
 PROBLEMS = {
     "gas": Problem(
         "two gas containers",
-        f"{REPORT_TEXT} The set-up is that of the code of the authors of GFINN. A few starts near the walls, "
-        "which are rare "
-        "in the data, make up a large part of all means. Models of which more is known lose to NMS after T: their "
-        "descents end at losses about ten times larger, and more neurons do not help.",
+        "The problem is that of the published code of GFINN. A few trajectories that start near the walls, which are "
+        "rare in the data, dominate the means. Beyond T, models with more prior knowledge are less accurate than NMS. "
+        "Their training ends at a ten times larger loss, and wider networks do not help. The long forecast lasts "
+        f"{LONG_RUN_FACTOR} T.",
         _gas_field,
         lambda r: np.array([1.0, 0.0, 2.0, 2.0]) + r.uniform(-1.0, 1.0, 4) * [0.8, 1.0, 1.0, 1.0],
         0.02,
@@ -88,9 +76,9 @@ PROBLEMS = {
     ),
     "pendulum": Problem(
         "thermoelastic double pendulum",
-        "As above. The pendulum has parameters of our own. To T the errors of GFINN are about those of `lt.learn`. "
-        "Models of which more is known lose to both peers after T: their descents end at losses about twenty times "
-        "larger.",
+        "The parameters of the pendulum are our own. To T, GFINN is about as accurate as `lt.learn`. Beyond T, models "
+        "with more prior knowledge are less accurate than both peers. Their training ends at a twenty times larger "
+        f"loss. The long forecast lasts {LONG_RUN_FACTOR} T.",
         _pendulum_field,
         lambda r: np.array([1.0, 0.0, 2.1, 0.0, 0.0, 0.5, 0.0, 1.0, 0.2, 0.4]) + r.uniform(-0.2, 0.2, 10),
         0.05,

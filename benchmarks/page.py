@@ -13,25 +13,45 @@ from .report import Report, Table, Target, targets_table
 
 RUNS_FILE = Path(__file__).parent / "runs.md"
 """File with every run, which the site does not show."""
+LEARNING_PAGE_NAME = "benchmarks_learning.md"
+"""Name of the page on learned systems, in the folder of the main page."""
 
 INTRODUCTION = """\
 # Benchmarks
 
-How fast this library is beside other programs, and where it loses. Bars to the left of the line are wins.
+How fast this library is beside other programs, and where it loses. A point left of the line is a task in which this
+library is faster. {{doc}}`benchmarks_learning` has the errors of learned systems.
 
-![Time of this library over the time of another program, work by work, on a logarithmic axis](benchmarks.svg)
+![Time of this library over the time of another program, task by task, on a logarithmic axis](benchmarks.svg)
+
+{summary}
 """
 """Beginning of the main page."""
+
+LEARNING_INTRODUCTION = """\
+# Benchmarks of learned systems
+
+How accurate the forecasts of learned systems are, and how well they conserve the energy. The forecasts start from the
+first states of trajectories that were not used for training; the errors are means over all components and times.
+*Energy drift* and *least entropy increment* belong to one long forecast, and to the energy and the entropy that were
+learned. T is the duration of the data.
+
+GFINN and NMS are reimplementations from the papers. All models have the same data, loss, optimizer, learning rate,
+batches and network sizes. GFINN and NMS forecast with RK4, and `lt.learn` with a method of the same order that obeys
+both laws in every step. The learning rate and the loss of `lt.learn` were chosen on other trajectories. The page quotes
+no figures of the authors, because their tables could not be looked up."""
+"""Beginning of the page on learned systems."""
 
 METHODOLOGY = """\
 ## How it was measured
 
-Contestants take turns, and the best time of each counts. Both times of a row come from one run on one machine. Work in
-one thread is timed by the clock of the processor; where threads or processes are compared, the clock on the wall is
-used. *Equal accuracy* means that the other program has the loosest tolerance with which it is at least as accurate.
-*Laws* compares the drift of the energy and the least increment of the entropy in a step with the tolerances of the
-tests. {missed}. The file `benchmarks/runs.md` has the machine, the targets and the figures of every run. `make bench`
-measures everything anew and writes this page and that file; the programs are in `benchmarks/`."""
+Each time belongs to the unit of work in the column *Time of*. The programs take turns, and the best time of each
+counts. Both times of a row come from one session on one machine. Work in one thread is timed by the processor clock;
+work in threads or processes is timed by the wall clock. *Equal accuracy* means that the other program has the loosest
+tolerance with which it is at least as accurate. *Drift* is the largest relative change of the energy, unless the text
+above the table says otherwise. {missed}. The file `benchmarks/runs.md` has the machine, the targets and the figures of
+every run. `make bench` repeats all measurements and writes this page and that file; the programs are in
+`benchmarks/`."""
 """Section of the main page on the measurements."""
 
 RUNS_INTRODUCTION = """\
@@ -46,7 +66,7 @@ tests."""
 
 
 def write_pages(results: Path, page: Path, runs: Path = RUNS_FILE) -> None:
-    """Write the page with its figures, and the file of every run, from all results in the folder.
+    """Write the page with its figures, the page on learned systems beside it, and the file of every run.
 
     Raises
     ------
@@ -64,16 +84,17 @@ def write_pages(results: Path, page: Path, runs: Path = RUNS_FILE) -> None:
 
     draw_time_ratios(first_page.compare_themes(reports), page.parent / "benchmarks.svg")
     summary, *themes = first_page.page_sections(reports)
-    _write_page(
-        page,
-        [INTRODUCTION + "\n" + summary, *themes, METHODOLOGY.format(missed=first_page.missed_targets_text(targets))],
-    )
+    methodology = METHODOLOGY.format(missed=first_page.missed_targets_text(targets))
+    _write_page(page, [INTRODUCTION.format(summary=summary), *themes, methodology])
+    learning_sections = list(first_page.learning_sections(reports))
+    if learning_sections:
+        _write_page(page.with_name(LEARNING_PAGE_NAME), [LEARNING_INTRODUCTION, *learning_sections])
 
     machines, differing = _machine_section(result_files)
     parts = [RUNS_INTRODUCTION, machines, _target_section(targets)]
-    full_reports = [name for names in first_page.FULL_REPORT_THEMES.values() for name in names]
     for name, report in reports.items():
-        parts.append(f"## {report.title}\n\nOn the page of benchmarks." if name in full_reports else report.markdown())
+        on_a_page = name in first_page.LEARNING_MEASUREMENTS
+        parts.append(f"## {report.title}\n\nOn the page of learned systems." if on_a_page else report.markdown())
         if name in differing:
             parts.append(f"Measured elsewhere: {differing[name]}.")
         if report.series:

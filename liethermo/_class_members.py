@@ -20,8 +20,6 @@ CLASS_MEMBERS.update(
         "ThermodynamicHerglotz": "hamiltonian_system",
         "EvolutionSystem": "temperature",
         "ComposedSystem": "split entropies numbers_of_particles chemical_potentials",
-        "AttitudeSystem": "initial_state points max_attitude_residual max_spatial_momentum_change",
-        "DrivenSystem": "time work",
         "SpinSystem": "spins largest_step",
         "QuantumSystem": """
             density reduced expectation bloch steady_state heat_currents power adiabatic_parameter coupled

@@ -68,7 +68,8 @@ def check_outputs(
 ) -> None:
     """Assert that a program gives the expected outputs: numbers to rounding, NaN and infinity at the same entries.
 
-    With ``hidden_nan``, a number is accepted where JAX has NaN, because a structural zero times NaN is zero.
+    With ``hidden_nan``, a number is accepted where JAX has NaN, because a structural zero times NaN is zero. Outputs
+    after such a number are not compared: they may be computed from it.
     """
     outputs = program.evaluate(*args) if outputs is None else outputs
     assert [a.shape for a in outputs] == [a.shape for a in expected]
@@ -89,6 +90,8 @@ def check_outputs(
         assert not is_wrong.any(), (
             f"output {i}: {output[is_wrong]} is not {reference[is_wrong]}, spread {spread[is_wrong]}"
         )
+        if (np.isnan(reference) & ~np.isnan(output)).any():
+            return
 
 
 def number_class(a):

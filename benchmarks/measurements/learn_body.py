@@ -81,11 +81,11 @@ def run(is_quick: bool) -> Report:
     errors = dict.fromkeys(["Error of I₁/I₃", "I₂/I₃", "Friction × I₃", "Angle to 2 T", "Energy drift"], "error")
     columns = {"Records": "text", **errors, "Least entropy increment": "error", "Training": "seconds"}
     text = (
-        f"{N_RECORDS} records of the attitude of a body with the inertia (3, 2, 1) and friction inside, to T = "
-        f"{T_END:g}, "
-        "201 attitudes each, with errors. The fit starts from the inertia (2.4, 2, 1.4) and 2.5 times the friction. No "
-        "momentum, temperature or entropy is in the data. Attitudes tell the inertia up to a factor, so the table has "
-        "relative errors of what does not depend on it. *Angle* is the largest error of a forecast to 2 T, in radians; "
-        "the laws are those of a forecast to 100 T. Both peers take states as data, so they have no part in this."
+        f"The data are {N_RECORDS} records of the attitude of a body with the inertia (3, 2, 1) and internal friction, "
+        f"each with 201 attitudes from t = 0 to T = {T_END:g} and with measurement errors. The fit starts from the "
+        "inertia (2.4, 2, 1.4) and from 2.5 times the friction. The data contain no momentum, temperature or entropy. "
+        "Attitudes determine the inertia up to a factor, so the table has the relative errors of quantities that do "
+        "not depend on this factor. *Angle* is the largest error of a forecast to 2 T, in radians. The long forecast "
+        "lasts 100 T. GFINN and NMS learn from states, so they cannot solve this problem."
     )
     return Report("Learned: a body from its attitudes", text, [Table("", columns, rows)])

@@ -68,7 +68,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
     for its corrections ends the run with a status.
 
     On a manifold the scheme runs in the arrays around it. With ``retraction`` it runs in the chart ``v -> R(x, v)``
-    around the state, a new chart in each step, with the same order and laws. See :class:`InCharts`.
+    around the state, a new chart in each step, with the same order and laws.
 
     Parameters
     ----------

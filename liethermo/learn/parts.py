@@ -163,7 +163,7 @@ class Friction(Dissipation):
 
     - ``"skew"``: ``A_k(x) dH`` with skew matrices A_k [cf. Zhang et al. 2022]; smooth where dH = 0 too.
     - ``"projected"``: ``b_k(x)`` minus its component along ``G dH``, where G is diagonal with the squared standard
-    deviations of the data [cf. Gruber et al. 2025]: n numbers a column instead of n (n - 1)/2.
+      deviations of the data [cf. Gruber et al. 2025]: n numbers a column instead of n (n - 1)/2.
 
     A discrete gradient dH is in their kernel too, so the energy is conserved exactly in every step.
 

@@ -70,7 +70,11 @@ def evaluate_ensemble_laws(
         ensemble_laws.append(
             ensemble_law(f"relative {name} increment", increment, rounding.allowed_change(tolerances.energy))
         )
-    if laws.entropy == "nondecreasing":
+    if laws.entropy == "conserved":
+        rounding = RoundingScale(ensemble.entropy_scale, ensemble.entropy_sensitivity, entropy_terms)
+        change = np.maximum(np.abs(ensemble.entropy_change), -ensemble.least_entropy_increment) / rounding.scale
+        ensemble_laws.append(ensemble_law("entropy drift", change, rounding.allowed_change(tolerances.casimirs)))
+    elif laws.entropy == "nondecreasing":
         rounding = RoundingScale(ensemble.entropy_scale, ensemble.entropy_sensitivity, entropy_terms)
         fall = -ensemble.least_entropy_increment / rounding.scale
         ensemble_laws.append(

@@ -217,15 +217,17 @@ class Propagator:
 
         Parameters
         ----------
-        x0 : array, shape (n,), or (*sites, d)
+        x0 : array, shape (n,), or ``(*sites, d)``
+            The initial state.
         t_span : (float, float)
+            The initial and the final time.
         parameters : dict from str to array, optional
             As in a call of the propagator.
 
         Raises
         ------
         InputError, ConvergenceError, NonFiniteError
-            As :func:`integrate`.
+            As :func:`integrate` does.
         """
         if parameters:
             return self.with_parameters(parameters).final(x0, t_span)

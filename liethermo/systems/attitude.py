@@ -47,7 +47,7 @@ class AttitudeSystem(LiftedSystem):
     ----------
     body : LiePoissonSystem, or DrivenSystem of one
     reconstruction : {"coadjoint", "cayley", "exp"}
-        Method that computes the attitude: see :class:`liethermo.WithAttitude`.
+        Method that computes the attitude: see :class:`~liethermo.integrators.WithAttitude`.
     group : manifolds.MatrixGroup
     """
 

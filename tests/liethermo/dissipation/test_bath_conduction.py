@@ -7,6 +7,7 @@ from scipy.integrate import solve_ivp
 import liethermo as lt
 import manifolds as mf
 from liethermo.systems.spins import reorder_spins
+from tests.refusals import refusal_test
 
 FIELD = 1.2
 RATE = 0.3
@@ -134,11 +135,7 @@ def _with(baths, conductance):
     return lt.SpinSystem(1, lt.magnetism.zeeman(1, (0.0, 0.0, 1.0)), damping, baths)
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_bad_conductances_are_refused(name):
-    attempt, says = BAD[name]
-    with pytest.raises(lt.InputError, match=says):
-        attempt()
+test_bad_conductances_are_refused = refusal_test(BAD)
 
 
 def test_bodies_with_baths_conduct_too():

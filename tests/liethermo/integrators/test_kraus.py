@@ -22,6 +22,7 @@ def observed_orders(system, expected, steps, order):
     return np.log2(np.array(errors[:-1]) / errors[1:])
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("order", [2, 4])
 def test_order_with_a_constant_generator(order):
     system = lt.QuantumSystem(H, lt.LindbladJumps(JUMPS))
@@ -30,6 +31,7 @@ def test_order_with_a_constant_generator(order):
     assert (orders > order - 0.2).all()
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("order", [2, 4])
 def test_order_with_a_drive_and_rates_that_depend_on_time(order):
     system = lt.QuantumSystem(
@@ -51,6 +53,7 @@ def test_order_with_a_drive_and_rates_that_depend_on_time(order):
     np.testing.assert_allclose(run.casimirs["work"][-1], expected[4].real, atol={2: 2e-4, 4: 2e-7}[order])
 
 
+@pytest.mark.sampled("30.0-4")
 @pytest.mark.parametrize("order", [2, 4])
 @pytest.mark.parametrize("step", [0.3, 3.0, 30.0])
 def test_every_step_is_a_channel(order, step):

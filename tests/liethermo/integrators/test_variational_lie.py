@@ -13,6 +13,7 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.models.body_with_wheels import body_with_wheels_rest
 from liethermo.tracing.interpret import evaluate_at_points
+from tests.refusals import refusal_test
 
 body = functools.cache(lt.models.body_with_wheels)
 X0 = [0.1, 1.0, 0.2, 0.5, -0.3, 0.4, 0.0]
@@ -212,30 +213,24 @@ def test_an_ordinary_solver_does_not_conserve_spatial_momentum():
     assert np.abs(norms - norms[0]).max() > 1e-8
 
 
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize(
-    ("build", "error", "words"),
-    [
-        (lambda: lt.EulerPoincareClosedSystem(mf.so(3), lambda xi, S: xi[0] ** 2 - S), lt.InputError, "singular"),
+test_bad_input = pytest.mark.sampled(1)(
+    refusal_test(
+        (lambda: lt.EulerPoincareClosedSystem(mf.so(3), lambda xi, S: xi[0] ** 2 - S), "singular"),
         (
             lambda: lt.EulerPoincareClosedSystem(mf.so(3), coupled_lagrangian, lambda xi, S: 0.1 * xi),
-            lt.AxiomError,
             r"entropy law|f \. xi",
+            lt.AxiomError,
         ),
         (
             lambda: lt.EulerPoincareClosedSystem(mf.so(3), coupled_lagrangian, lambda xi, S: xi[:2]),
-            lt.FunctionError,
             "friction",
+            lt.FunctionError,
         ),
-        (lambda: lt.models.body_with_wheels(wheels=(0.1, 0.0, 0.1)), lt.InputError, "wheels"),
+        (lambda: lt.models.body_with_wheels(wheels=(0.1, 0.0, 0.1)), "wheels"),
         (
             lambda: METHOD.check(lt.EulerPoincareClosedSystem(mf.sl(3), lambda xi, S: 0.5 * xi @ xi - jnp.exp(S))),
-            lt.InputError,
             "Cayley map does not take",
         ),
-        (lambda: METHOD.check(lt.models.rigid_body()), lt.InputError, "got a LiePoissonSystem"),
-    ],
+        (lambda: METHOD.check(lt.models.rigid_body()), "got a LiePoissonSystem"),
+    )
 )
-def test_bad_input(build, error, words):
-    with pytest.raises(error, match=words):
-        build()

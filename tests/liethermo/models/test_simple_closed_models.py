@@ -9,6 +9,7 @@ import liethermo as lt
 from liethermo.models.cylinder import cylinder_rest
 from liethermo.models.mass_spring_gas import CASES, mass_spring_gas_solution
 from liethermo.tracing.interpret import evaluate_at_points
+from tests.refusals import refusal_test
 
 START = [0.3, -0.2, 0.1]
 FRICTIONS = {"undamped": 0.0, "underdamped": 2.0, "critical": 10.0, "overdamped": 25.0}
@@ -90,15 +91,10 @@ def test_pressure_and_heat_may_depend_on_time():
     assert rate_at_0[4] == 10.0
 
 
-@pytest.mark.parametrize(
-    ("build", "words"),
-    [
-        (lambda: lt.models.mass_spring_gas(mass=0.0), "mass must be positive"),
-        (lambda: lt.models.mass_spring_gas(friction=-1.0), "inject"),
-        (lambda: lt.models.cylinder(area=-1.0), "area must be positive"),
-        (lambda: lt.models.cylinder(pressure=lambda q, v, S: v * np.ones(2)), "external force"),
-    ],
+test_invalid_parameters_are_refused = refusal_test(
+    (lambda: lt.models.mass_spring_gas(mass=0.0), "mass must be positive"),
+    (lambda: lt.models.mass_spring_gas(friction=-1.0), "inject"),
+    (lambda: lt.models.cylinder(area=-1.0), "area must be positive"),
+    (lambda: lt.models.cylinder(pressure=lambda q, v, S: v * np.ones(2)), "external force"),
+    error=(lt.InputError, lt.FunctionError),
 )
-def test_invalid_parameters_are_refused(build, words):
-    with pytest.raises((lt.InputError, lt.FunctionError), match=words):
-        build()

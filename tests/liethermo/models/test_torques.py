@@ -13,6 +13,7 @@ import liethermo as lt
 from liethermo.engines.compiled.step_loop import CompiledEngine
 from liethermo.models.orbits import eccentric_anomaly, rotate
 from liethermo.runs.preparation import prepare_system_and_method
+from tests.refusals import refusal_test
 
 T = lt.torques
 
@@ -282,28 +283,22 @@ def test_tables_are_scipys_splines(m):
     assert not np.any(jax.vmap(T.Table(t, y))(np.array([t[0] - 1e-9, t[-1] + 1e-9])))
 
 
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (lambda: T.Tabulated(lambda t: t), "kind='cubic'"),
-        (lambda: T.Tabulated([0.0, 1.0]), "spline of SciPy alone"),
-        (lambda: T.Tabulated(SPLINE, MOMENTS), "spline was given"),
-        (lambda: T.Tabulated(NODES, MOMENTS, kind="quadratic"), "kind must be"),
-        (lambda: T.Tabulated(scipy.interpolate.CubicSpline(NODES, MOMENTS.T, axis=1)), "axis 0"),
-        (lambda: lt.models.free_rigid_body(attitude=True, torque=SPLINE), r"Tabulated\(spline\)"),
-        (lambda: T.BDot(-1.0, np.ones(3)), "gain must be >= 0"),
-        (lambda: T.RayleighDrag(-np.eye(3)), "positive semidefinite"),
-        (lambda: T.RayleighDrag(-1.0), ">= 0"),
-        (lambda: T.Orbit(1.0, eccentricity=1.0), "below 1"),
-        (lambda: T.DipoleField(DIPOLE, np.ones(3)), "function of t"),
-        (lambda: T.SolarPressurePlates([1.0], [[0, 0, 0.0]], [[0, 0, 1.0]]), "must not be zero"),
-        (lambda: T.SolarPressurePlates([1.0], [[0, 0, 1.0]], [[0, 0, 1.0]], 0.7, 0.7), "at most 1"),
-        (lambda: T.Thrusters(np.zeros((2, 3)), np.zeros((3, 3))), "shape"),
-    ],
+test_bad_torques_are_refused = refusal_test(
+    (lambda: T.Tabulated(lambda t: t), "kind='cubic'"),
+    (lambda: T.Tabulated([0.0, 1.0]), "spline of SciPy alone"),
+    (lambda: T.Tabulated(SPLINE, MOMENTS), "spline was given"),
+    (lambda: T.Tabulated(NODES, MOMENTS, kind="quadratic"), "kind must be"),
+    (lambda: T.Tabulated(scipy.interpolate.CubicSpline(NODES, MOMENTS.T, axis=1)), "axis 0"),
+    (lambda: lt.models.free_rigid_body(attitude=True, torque=SPLINE), r"Tabulated\(spline\)"),
+    (lambda: T.BDot(-1.0, np.ones(3)), "gain must be >= 0"),
+    (lambda: T.RayleighDrag(-np.eye(3)), "positive semidefinite"),
+    (lambda: T.RayleighDrag(-1.0), ">= 0"),
+    (lambda: T.Orbit(1.0, eccentricity=1.0), "below 1"),
+    (lambda: T.DipoleField(DIPOLE, np.ones(3)), "function of t"),
+    (lambda: T.SolarPressurePlates([1.0], [[0, 0, 0.0]], [[0, 0, 1.0]]), "must not be zero"),
+    (lambda: T.SolarPressurePlates([1.0], [[0, 0, 1.0]], [[0, 0, 1.0]], 0.7, 0.7), "at most 1"),
+    (lambda: T.Thrusters(np.zeros((2, 3)), np.zeros((3, 3))), "shape"),
 )
-def test_bad_torques_are_refused(build, message):
-    with pytest.raises(lt.InputError, match=message):
-        build()
 
 
 def test_the_program_of_a_long_table_is_short():

@@ -458,6 +458,17 @@ def test_members_of_an_ensemble_that_start_at_rest():
     assert only_row(member_audit, "consistency").value < 1e-10
 
 
+@pytest.mark.parametrize("outputs", ["trajectory", "final", "summary"])
+def test_an_ensemble_reports_an_entropy_that_should_be_constant(outputs):
+    """The midpoint scheme keeps quadratic Casimirs only; one run and an ensemble both say that the entropy changes."""
+    system = lt.QuantumSystem(np.array([[0.0, 0.4, 0.2j], [0.4, 1.0, 0.7], [-0.2j, 0.7, 2.5]]))
+    x0s = np.stack([system.state(np.diag(p)) for p in ([0.6, 0.3, 0.1], [0.2, 0.5, 0.3])])
+    for method, passes in ((lt.MetriplecticGauss(2), True), (lt.MetriplecticMidpoint(), False)):
+        single = lt.integrate(system, x0s[0], (0.0, 5.0), 0.25, method).audit()
+        many = lt.ensemble(system, x0s, (0.0, 5.0), 0.25, method, outputs=outputs).audit()
+        assert only_row(single, "entropy drift").passed is only_row(many, "entropy drift").passed is passes
+
+
 # -- what is conserved ------------------------------------------------------------------------------------------------
 
 

@@ -11,6 +11,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines.select_engine import CompiledEngineWarning
+from liethermo.systems import invariants
 
 SPAN = (0.0, 1.3)
 STEP = 0.25
@@ -228,3 +229,16 @@ def test_a_run_that_fell_back_is_told_each_time():
     for _ in range(2):
         with pytest.warns(CompiledEngineWarning, match="array engine"):
             assert propagator(MU, SPAN).provenance["engine"] == "array"
+
+
+def test_what_is_conserved_is_found_once_for_each_set_of_parameters(monkeypatch):
+    """Systems with new parameters hold arrays that cannot change, so that what was found for one is kept."""
+    p = lt.Propagator(lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2), lt.MetriplecticRungeKutta(4), step=0.5)
+    tested = []
+    find_verdicts = invariants._conservation_verdicts
+    monkeypatch.setattr(
+        invariants, "_conservation_verdicts", lambda system, near=None: tested.append(1) or find_verdicts(system, near)
+    )
+    for rate in (0.11, 0.12, 0.13):
+        p.final([0.1, 0.2, 1.0], (0.0, 2.0), parameters={"dissipation.rate": rate})
+    assert len(tested) == 3

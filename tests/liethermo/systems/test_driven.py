@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.systems.driven import CLOCK_UNIT
+from liethermo.systems.driven import CLOCK_UNIT, DrivenSystem
 from liethermo.tracing.interpret import evaluate_at_points
 
 RATE = 1.3
@@ -159,7 +159,7 @@ def _slopes(model, z):
 def slopes(system, method, states, rates):
     """At some states, shape (m, n), with slopes, shape (m, stages, n), in a driven system with ``t' = 1``."""
     if system.is_driven:
-        system = lt.DrivenSystem(system)
+        system = DrivenSystem(system)
         states = system.initial_state(states, 0.5, batch=True)
         rates = np.concatenate([rates, np.full((*rates.shape[:-1], 2), system.unit)], axis=-1)
     return evaluate_at_points(
@@ -328,7 +328,7 @@ def test_the_axioms_are_tested_at_random_times():
 
 
 def test_a_driven_system_is_the_same_when_taken_apart():
-    driven = lt.DrivenSystem(SPIN)
+    driven = DrivenSystem(SPIN)
     leaves, structure = jax.tree_util.tree_flatten(driven)
     again = jax.tree_util.tree_unflatten(structure, leaves)
     y = driven.initial_state(SPIN_START, 0.9)
@@ -388,7 +388,7 @@ def test_an_euler_poincare_system_with_changing_inertia():
     mu, t = jnp.asarray(SPIN_START), 0.9
     assert np.allclose(by_velocity.velocity(mu, t), mu / growing_inertia(t), rtol=1e-14)
     assert np.allclose(by_velocity.momentum(mu / growing_inertia(t), t), mu, rtol=1e-14)
-    fields = [lt.DrivenSystem(s, unit=1.0) for s in (by_velocity, by_momentum)]
+    fields = [DrivenSystem(s, unit=1.0) for s in (by_velocity, by_momentum)]
     found = [s.vector_field(s.initial_state(mu, t)) for s in fields]
     assert np.allclose(*found, rtol=1e-12, atol=1e-14)
     assert not by_velocity.can_unroll

@@ -7,6 +7,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
+from liethermo.dissipation.projected_metric import GlobalRateWarning
 
 SITES = (3, 2)
 G = mf.so(3) ** SITES
@@ -104,7 +105,7 @@ def test_local_rates_do_not_depend_on_the_number_of_sites_and_global_ones_do():
 
     local = [production(lt.LocalProjectedMetric(), n) for n in (2, 20)]
     assert local[1] == pytest.approx(local[0], rel=1e-12)
-    with pytest.warns(lt.GlobalRateWarning, match="LocalProjectedMetric, which acts site by site"):
+    with pytest.warns(GlobalRateWarning, match="LocalProjectedMetric, which acts site by site"):
         over = [production(lt.ProjectedMetric(), n) for n in (2, 20)]
     assert over[1] == pytest.approx(10.0 * over[0], rel=1e-12)
 

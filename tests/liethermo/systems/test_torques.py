@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.systems.driven import _TorqueForce
+from liethermo.systems.driven import DrivenSystem, _TorqueForce
 
 INERTIA = np.array([3.2, 3.0, 1.0])
 START = np.array([0.8, 0.5, 1.3])
@@ -132,7 +132,7 @@ def test_work_by_another_gradient_breaks_the_ledger(monkeypatch):
         _TorqueForce, "force", lambda self, system, x, dH, dS, dL: system.torque_velocity(x, system.energy.gradient(x))
     )
     monkeypatch.setattr(
-        lt.DrivenSystem,
+        DrivenSystem,
         "field",
         lambda self, x, dH, dS, dL=(): _reversible_field(self, x, dH) + self.dissipation.force(self, x, dH, dS, dL),
     )

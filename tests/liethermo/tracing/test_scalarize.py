@@ -14,8 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.special
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from jax import lax
 from jax.ad_checkpoint import checkpoint_name
 from jax.extend.core import jaxprs_in_params
@@ -659,127 +657,6 @@ def test_special_values_of_reductions():
         check_agrees_with_jax(
             lambda a, f=f: f(a, axis=-1), np.array([[1.0, np.nan, np.inf], [np.inf, 2.0, 3.0], [0.0, -np.inf, np.inf]])
         )
-
-
-# -- random programs --------------------------------------------------------------------------------------------------
-
-SPARSE_TENSOR = np.zeros((4, 4, 4))
-for a, b, c in [(0, 1, 2), (1, 2, 0), (2, 0, 1), (3, 3, 1)]:
-    SPARSE_TENSOR[a, b, c], SPARSE_TENSOR[b, a, c] = 1.0, -0.5
-
-
-def resize_like(b, a):
-    """Return b in the shape of a."""
-    return jnp.resize(b, a.shape)
-
-
-def limit_axes(a):
-    return a[tuple(slice(4) for _ in a.shape)]
-
-
-def step_along_axis(f):
-    """Return a step that applies a function along some axis."""
-    return lambda a, b, k: f(a, k % a.ndim) if a.ndim else a
-
-
-def small_matrix(a):
-    return limit_axes(a.reshape(-1, a.shape[-1] if a.ndim else 1))
-
-
-STEPS = {
-    "add": lambda a, b, k: a + resize_like(b, a),
-    "sub": lambda a, b, k: a - resize_like(b, a),
-    "mul": lambda a, b, k: a * resize_like(b, a),
-    "div": lambda a, b, k: a / resize_like(b, a),
-    "safe div": lambda a, b, k: a / (1.0 + resize_like(b, a) ** 2),
-    "scale": lambda a, b, k: (k - 2) * a,
-    "shift": lambda a, b, k: a + (k - 2),
-    "reflect": lambda a, b, k: (k - 2) - a,
-    "invert": lambda a, b, k: (k - 2) / a,
-    "neg": lambda a, b, k: -a,
-    "max": lambda a, b, k: jnp.maximum(a, resize_like(b, a)),
-    "min": lambda a, b, k: jnp.minimum(a, 0.1 * k),
-    "clip": lambda a, b, k: jnp.clip(a, -1.0, 1.0),
-    "power": lambda a, b, k: a ** (k - 2),
-    "pow": lambda a, b, k: jnp.abs(a) ** resize_like(b, a),
-    "sqrt": lambda a, b, k: jnp.sqrt(a),
-    "exp": lambda a, b, k: jnp.exp(a),
-    "log": lambda a, b, k: jnp.log(a),
-    "log1p": lambda a, b, k: jnp.log1p(a * a),
-    "sin": lambda a, b, k: jnp.sin(a),
-    "tanh": lambda a, b, k: jnp.tanh(a),
-    "atan2": lambda a, b, k: jnp.arctan2(a, resize_like(b, a)),
-    "norm": lambda a, b, k: jnp.linalg.norm(a),
-    "where": lambda a, b, k: jnp.where(a > resize_like(b, a), a, 2.0 * resize_like(b, a)),
-    "which": lambda a, b, k: jnp.where((a > 0.3) & ~(resize_like(b, a) > 0.5), jnp.sqrt(a), k),
-    "sign": lambda a, b, k: jnp.sign(a),
-    "floor": lambda a, b, k: jnp.floor(a) + jnp.round(a),
-    "mod": lambda a, b, k: jnp.mod(a, 0.7),
-    "floor_divide": lambda a, b, k: jnp.floor_divide(a, 0.3),
-    "sinc": lambda a, b, k: jnp.sinc(a),
-    "flatten": lambda a, b, k: limit_axes(a.ravel()),
-    "transpose": lambda a, b, k: a.T,
-    "square": lambda a, b, k: jnp.resize(a, (k % 3 + 1, 4)),
-    "reverse": step_along_axis(jnp.flip),
-    "roll": step_along_axis(lambda a, axis: jnp.roll(a, 1, axis)),
-    "take": lambda a, b, k: a[k % a.shape[0]] if a.ndim else a,
-    "gather": lambda a, b, k: a[np.array([0, -1, k % a.shape[0]])] if a.ndim else a,
-    "set": lambda a, b, k: a.at[k % a.shape[0]].set(0.3) if a.ndim else a,
-    "add at": lambda a, b, k: a.at[np.array([0, k % a.shape[0], 0])].add(jnp.sum(b)) if a.ndim else a,
-    "dynamic": lambda a, b, k: lax.dynamic_slice_in_dim(a, k - 1, 1) if a.ndim else a,
-    "join": lambda a, b, k: limit_axes(jnp.concatenate([a.ravel()[k % a.size :], b.ravel()])),
-    "stack": lambda a, b, k: jnp.stack([jnp.resize(a, 4), jnp.resize(b, 4)]),
-    "pad": step_along_axis(lambda a, axis: limit_axes(jnp.pad(a, [(i == axis, 0) for i in range(a.ndim)]))),
-    "trim": step_along_axis(
-        lambda a, axis: lax.pad(a, 1.5, [((-1, 1, 0) if i == axis else (0, 0, 0)) for i in range(a.ndim)])
-    ),
-    "tril": lambda a, b, k: jnp.tril(small_matrix(a), k - 2),
-    "split": step_along_axis(lambda a, axis: sum(jnp.split(a, a.shape[axis], axis))),
-    "sum": step_along_axis(lambda a, axis: a.sum(axis)),
-    "mean": lambda a, b, k: a.mean(),
-    "prod": step_along_axis(lambda a, axis: a.prod(axis)),
-    "largest": step_along_axis(lambda a, axis: a.max(axis)),
-    "least": lambda a, b, k: a.min(),
-    "argmax": step_along_axis(lambda a, axis: 1.0 * jnp.argmax(a, axis)),
-    "any": step_along_axis(lambda a, axis: jnp.any(a > 0.5, axis) * 1.0),
-    "cumsum": step_along_axis(jnp.cumsum),
-    "cumprod": step_along_axis(jnp.cumprod),
-    "cummax": step_along_axis(lax.cummax),
-    "matmul": lambda a, b, k: small_matrix(a) @ jnp.resize(b, (small_matrix(a).shape[1], k % 3 + 1)),
-    "outer": lambda a, b, k: jnp.outer(jnp.resize(a, 3), jnp.resize(b, 4)),
-    "bracket": lambda a, b, k: jnp.einsum("abc,a,b->c", SPARSE_TENSOR, jnp.resize(a, 4), jnp.resize(b, 4)),
-    "batched": lambda a, b, k: jnp.einsum("ia,ib->iab", jnp.resize(a, (2, 2)), jnp.resize(b, (2, 2)))[1],
-    "cholesky": lambda a, b, k: jnp.linalg.cholesky(jnp.outer(jnp.resize(a, 2), jnp.resize(a, 2)) + jnp.eye(2)),
-    "scan": lambda a, b, k: lax.scan(lambda s, t: (s * 0.5 + t, s - t), 1.0, jnp.resize(a, 3))[1],
-    "grad": lambda a, b, k: jax.grad(lambda z: jnp.sum(jnp.sin(z * resize_like(b, a)) ** 2))(a),
-}
-
-SUMMARIES = {
-    "value": lambda f: f,
-    "grad": lambda f: jax.grad(lambda x, y: jnp.sum(f(x, y)[-1]), argnums=(0, 1)),
-    "jvp": lambda f: lambda x, y: jax.jvp(f, (x, y), (jnp.ones_like(x), jnp.sin(y))),
-    "hessian": lambda f: jax.hessian(lambda x, y: jnp.sum(jnp.sin(f(x, y)[-1]))),
-    "jit": jax.jit,
-    "vmap": lambda f: lambda x, y: jax.vmap(lambda s: f(s * x, y))(jnp.array([0.5, 1.0])),
-}
-
-steps = st.tuples(st.sampled_from(list(STEPS)), st.integers(0, 5), st.integers(0, 5), st.integers(0, 5))
-shapes = st.lists(st.integers(1, 4), max_size=2).map(tuple)
-
-
-@pytest.mark.slow
-@settings(max_examples=60)
-@given(st.lists(steps, min_size=1, max_size=7), st.sampled_from(list(SUMMARIES)), shapes, shapes, st.integers(0, 99))
-def test_random_programs_agree(steps, summary, shape_x, shape_y, seed):
-    def run(x, y):
-        values = [x, y]
-        for name, i, j, k in steps:  # i and j count back from the newest value
-            values.append(STEPS[name](values[-1 - i % len(values)], values[-1 - j % len(values)], k))
-        return values[2:]
-
-    rng = np.random.default_rng(seed)
-    x, y = (rng.uniform(-1.5, 1.5, shape) for shape in (shape_x, shape_y))
-    check_agrees_with_jax(SUMMARIES[summary](run), x, y, hidden_nan=True)
 
 
 # -- no needless operation --------------------------------------------------------------------------------------------

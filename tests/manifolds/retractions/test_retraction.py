@@ -198,6 +198,8 @@ def test_antipodes_and_points_off_the_space():
             R(2 * north, 0 * north)
         with pytest.raises(mf.OffManifoldError, match="not tangent"):
             R(north, north)
+    with pytest.raises(mf.DomainError, match="not defined"):  # no tangent plane is projected onto the other half
+        mf.retraction(S2, "projection").vector(north, np.array([0.6, 0.0, -0.8]))
 
 
 def test_spaces_that_lack_a_retraction():

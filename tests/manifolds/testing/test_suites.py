@@ -2,25 +2,27 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import manifolds as mf
 from manifolds import testing
+from tests.cases import ALGEBRAS
 
 
 def params_by_name(objects):
     return [pytest.param(thing, id=thing.name) for thing in objects]
 
 
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize("g", params_by_name(mf.registered()))
+@pytest.mark.sampled(18)
+@pytest.mark.parametrize("g", params_by_name(ALGEBRAS))
 def test_algebras(g):
     assert testing.check_algebra(g, degree=2).passed
 
 
-@pytest.mark.sampled("SO(3)")
+@pytest.mark.sampled("SO(3)", "SL(2)")
 @pytest.mark.parametrize("G", params_by_name(mf.registered_groups()))
 def test_groups(G):
     assert testing.check_group(G).passed
@@ -56,6 +58,20 @@ def test_a_broken_group():
 
     with pytest.raises(testing.PropertyError, match=r"exp x is in the group .*FAILS"):
         testing.check_group(dataclasses.replace(group, name="short", exp_map=truncated_exp))
+
+
+@jax.tree_util.register_static
+class HalfBracketAlgebra(mf.LieAlgebra):
+    """Control: the bracket is half of the commutator."""
+
+    def bracket(self, x, y):
+        return 0.5 * super().bracket(x, y)
+
+
+def test_a_group_with_the_bracket_of_another_algebra():
+    half_algebra = HalfBracketAlgebra(mf.so(3).structure_constants, name="half", basis=mf.so(3).basis)
+    with pytest.raises(testing.PropertyError, match=r"exp u exp v = exp.* FAILS"):
+        testing.check_group(dataclasses.replace(mf.SO(3), name="half", algebra=half_algebra))
 
 
 class MismatchedSphere(mf.Sphere):

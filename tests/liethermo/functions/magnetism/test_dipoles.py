@@ -9,6 +9,7 @@ import scipy.special as special
 import liethermo as lt
 from liethermo.functions.magnetism.dipoles import lattice_kernel, padded_length
 from liethermo.functions.magnetism.ewald import dipole_tensor, ewald_kernel
+from tests.refusals import refusal_test
 
 mag = lt.magnetism
 RNG = np.random.default_rng(5)
@@ -213,8 +214,4 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_bad_dipoles_are_refused(name):
-    build, message = BAD[name]
-    with pytest.raises(lt.LiethermoError, match=message):
-        build()
+test_bad_dipoles_are_refused = refusal_test(BAD, error=lt.LiethermoError)

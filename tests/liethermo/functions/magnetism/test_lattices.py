@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
+from tests.refusals import refusal_test
 
 mag = lt.magnetism
 
@@ -132,8 +133,4 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_bad_lattices_are_refused(name):
-    build, message = BAD[name]
-    with pytest.raises(lt.LiethermoError, match=message):
-        build()
+test_bad_lattices_are_refused = refusal_test(BAD, error=lt.LiethermoError)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
+from tests.refusals import refusal_test
 
 mag = lt.magnetism
 UP = np.array([0.0, 0.0, 1.0])
@@ -201,8 +202,4 @@ def CHAIN():
     return mag.lattice("chain", 4)
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_bad_measurements_are_refused(name):
-    build, message = BAD[name]
-    with pytest.raises(lt.LiethermoError, match=message):
-        build()
+test_bad_measurements_are_refused = refusal_test(BAD, error=lt.LiethermoError)

@@ -13,6 +13,7 @@ from liethermo.functions.magnetism.newell import (
     mirror_octant,
     triangle_rule,
 )
+from tests.refusals import refusal_test
 
 mag = lt.magnetism
 MU0 = 4e-7 * math.pi
@@ -208,8 +209,4 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_bad_cells_are_refused(name):
-    build, message = BAD[name]
-    with pytest.raises(lt.LiethermoError, match=message):
-        build()
+test_bad_cells_are_refused = refusal_test(BAD, error=lt.LiethermoError)

@@ -10,6 +10,7 @@ import sympy
 
 import liethermo as lt
 from liethermo.systems.spins import reorder_spins
+from tests.refusals import refusal_test
 
 mag = lt.magnetism
 RNG = np.random.default_rng(3)
@@ -263,8 +264,4 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_bad_terms_are_refused(name):
-    build, message = BAD[name]
-    with pytest.raises(lt.LiethermoError, match=message):
-        build()
+test_bad_terms_are_refused = refusal_test(BAD, error=lt.LiethermoError)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
+from tests.refusals import refusal_test
 
 mag = lt.magnetism
 RANDOM = np.random.default_rng(7)
@@ -71,11 +72,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_bad_samples_are_refused(name):
-    attempt, says = BAD[name]
-    with pytest.raises(lt.InputError, match=says):
-        attempt()
+test_bad_samples_are_refused = refusal_test(BAD)
 
 
 @pytest.mark.slow

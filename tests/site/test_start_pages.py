@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 FIELDS = sorted(page for page in (DOCS / "start").glob("*.md") if page.stem not in ("index", "install", "adopt"))
 PAGES = [page for page in sorted(DOCS.rglob("*.md")) if not {"_build", "gallery", "generated"} & set(page.parts)]

@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 MAX_PACKAGES = 60
 """Most packages of a run: more would make the first demo wait."""
 

@@ -11,7 +11,7 @@ import pytest
 
 import liethermo as lt
 
-DOCS = Path(__file__).resolve().parent.parent / "docs"
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import matplotlib
 import pytest
 
-DOCS = Path(__file__).resolve().parent.parent / "docs"
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 PAGE = """# Title
 

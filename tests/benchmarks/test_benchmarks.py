@@ -27,7 +27,7 @@ from liethermo import MetriplecticGauss
 from liethermo.engines.solver_options import DEFAULT_OPTIONS
 from liethermo.engines.status_codes import StatusCode
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 needs_compiler = pytest.mark.skipif(native.find_c_compiler() is None, reason="no C compiler")
 
@@ -69,36 +69,47 @@ def test_the_driver_on_a_bare_machine(bare_machine, tmp_path, capsys):
 
 
 MAIN_PAGE = Path("docs/reference/benchmarks.md")
+LEARNING_PAGE = MAIN_PAGE.with_name(page.LEARNING_PAGE_NAME)
 RUNS = Path("benchmarks/runs.md")
 
 
-def test_both_pages_are_those_of_the_kept_results(tmp_path):
+def test_all_pages_are_those_of_the_kept_results(tmp_path):
     for path in (MAIN_PAGE, RUNS):
         (tmp_path / path).parent.mkdir(parents=True)
     page.write_pages(RESULT_FOLDER, tmp_path / MAIN_PAGE, tmp_path / RUNS)
-    for path in (MAIN_PAGE, RUNS):
+    for path in (MAIN_PAGE, LEARNING_PAGE, RUNS):
         assert (tmp_path / path).read_text() == (ROOT / path).read_text(), f"{path}: python -m benchmarks --kept --page"
     main_page = (tmp_path / MAIN_PAGE).read_text()
     assert len(main_page.split()) <= 3500
     assert (
         main_page.index("![") < main_page.index("\n- **") < main_page.index("\n| ")
     )  # the chart, the sentences, the tables
+    assert "broken" not in main_page
+    times = [row.split("|")[3].strip() for row in main_page.splitlines() if row.count("\u00a0× |") == 1]
+    assert len(times) > 30
+    assert all(re.match(r"an? (step|run|body|state)\b", unit) for unit in times)  # what each time is the time of
+    chart = (tmp_path / MAIN_PAGE).with_suffix(".svg").read_text()
+    width_points = float(re.search(r'<svg [^>]*width="([\d.]+)pt"', chart)[1])
+    smallest_font = min(float(size) for size in re.findall(r"font(?:-size)?: [^;\"]*?([\d.]+)px", chart))
+    assert smallest_font * 358 / width_points >= 10  # pixels, where the screen has 390 and the chart 358
 
 
 def test_a_page_has_one_row_a_comparison_and_escapes_bars():
     table = Table("", {"": "text", "| |s| - 1 |": "error", "Time": "seconds"}, [["a | b", 1e-16, 2e-6]])
     lines = table.markdown().strip().splitlines()
     assert [len(re.findall(r"(?<!\\)\|", line)) for line in lines] == [4, 4, 4]
-    rows = [["ours", 2.0, "hold"], ["peer, slow", 9.0, "hold"], ["peer, quick", 1.0, "broken: energy"]]
-    report = Report("", "", [Table("", {"": "text", "Time": "seconds", "Laws": "text"}, rows)])
-    pair = first_page.RowPair("some", 0, "work", "ours", "peer")
+    rows = [["ours", 2.0, 1e-9, 1e-16], ["peer, slow", 9.0, 1e-9, 2e-7], ["peer, quick", 1.0, 1e-5, 2e-3]]
+    columns = {"": "text", "Time": "seconds", "Error": "error", "Energy drift": "error"}
+    report = Report("", "", [Table("", columns, rows)])
+    pair = first_page.RowPair("some", 0, "work", "a step", "ours", "peer")
     comparison = first_page._compare_rows(report, pair)
-    assert comparison == first_page.PeerComparison(
-        "work", "peer, quick", 2.0, 1.0, "hold", "broken: energy"
-    )  # the fastest counts
-    (sentence, laws) = first_page.summary_sentences([dataclasses.replace(comparison, peer="heyoka")])
+    figures = first_page.RowFigures(2.0, 1e-9, 1e-16), first_page.RowFigures(1.0, 1e-5, 2e-3)
+    assert comparison == first_page.PeerComparison("work", "a step", "peer, quick", *figures)  # the fastest counts
+    accurate = first_page._compare_rows(report, dataclasses.replace(pair, max_error=1e-8))
+    assert accurate.peer == "peer, slow"
+    (sentence, conservation) = first_page.summary_sentences([dataclasses.replace(comparison, peer="heyoka")])
     assert "faster in 0 of 1 tasks" in sentence
-    assert "1 of 1 runs of this library and in 0 of theirs" in laws
+    assert "at most 1.0e-16 with this library, and 2.0e-03 to 2.0e-03 with the others (1 tasks)" in conservation
     assert first_page._compare_rows(report, dataclasses.replace(pair, theirs="nobody")) is None
 
 
