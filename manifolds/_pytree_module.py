@@ -15,19 +15,17 @@ Copied = TypeVar("Copied", bound=eqx.Module)
 
 
 if TYPE_CHECKING:
-    ModuleType = type
+    from equinox._module._module import _ModuleMeta as ListedModuleType
 else:
-    ModuleType = type(eqx.Module)
 
+    class ListedModuleType(type(eqx.Module)):
+        """Type of the classes of pytrees: ``dir`` of a class, and so ``help``, lists the members that users call.
 
-class ListedModuleType(ModuleType):
-    """Type of the classes of pytrees: ``dir`` of a class, and so ``help``, lists the members that users call.
+        What an instance has is listed in full.
+        """
 
-    What an instance has is listed in full.
-    """
-
-    def __dir__(cls) -> list[str]:
-        return listed_names(cls)
+        def __dir__(cls) -> list[str]:
+            return listed_names(cls)
 
 
 class Module(eqx.Module, metaclass=ListedModuleType):
