@@ -124,7 +124,7 @@ def flow(
     if save_at is not None and save_every is not None:
         raise InputError("flow takes save_at or save_every, got both. Remove one of them")
     save_every = 1 if save_at is not None else save_every
-    x, declared = system.state(x0), DeclaredTimes.of_tree(system)
+    x, declared = system.state(x0), DeclaredTimes.from_tree(system)
     schedule = make_schedule(t_span, step, save_every, breaks=breaks, declared=declared)
     times = None if save_at is None else checked_save_times(save_at, schedule)
     n, user_system = system.dim, system
