@@ -95,6 +95,12 @@ PROBE = """(() => {
     wide: document.documentElement.scrollWidth - window.innerWidth,
     culprits: all("body *").filter((e) => e.getBoundingClientRect().right > window.innerWidth + 1 && e.offsetParent
       && !inside(e)).slice(0, 3).map((e) => e.tagName + "." + e.className),
+    cut: all(".bd-article :is(p, dt, li, h1, h2, h3)").filter((e) => {
+      if (!e.offsetParent || e.getBoundingClientRect().right <= document.documentElement.clientWidth + 1) return false;
+      for (let node = e.parentElement; node && node !== document.body; node = node.parentElement)
+        if (["auto", "scroll"].includes(getComputedStyle(node).overflowX)) return false;
+      return true;
+    }).map((e) => e.textContent.trim().slice(0, 60)),
     headerLines: lines,
     previous: !!document.querySelector(".prev-next-footer a, .prev-next-area a"),
   };
@@ -255,6 +261,7 @@ def check_pages(chromium: Browser, html: Path, match: str = "*") -> list[str]:
             wrong.append(f"{name}: the header takes {seen['headerLines']} lines")
         chromium.resize(390)
         narrow = chromium.evaluate(PROBE)
+        wrong += [f"{name}: cut off at 390 pixels: {text}" for text in narrow["cut"][:3]]
         if narrow["wide"] > 0:
             wrong.append(f"{name}: {narrow['wide']} pixels wider than 390: {narrow['culprits']}")
     for name, link in sorted(set(links)):

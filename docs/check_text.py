@@ -18,7 +18,7 @@ NUMBER = re.compile(r"(?<![\w.^{])\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?(?![\w^])")
 CODE = re.compile(r"```.*?```|\$\$.*?\$\$|\$[^$\n]*\$|<!--.*?-->", re.DOTALL)
 
 FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
-LISTING = re.compile(r"^```(?:python|py|sh|bash|toml|text)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+LISTING = re.compile(r"^```\w+\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 CODE_ELEMENT = re.compile(r"<(code|pre)\b.*?</\1>", re.DOTALL)
 
 LOST_PARAGRAPH = re.compile(r"(?<=[.:;)`])  +(?=\S)|(?<=\S) ##+ \w")
