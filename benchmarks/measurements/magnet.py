@@ -174,8 +174,8 @@ def run(is_quick: bool) -> Report:
 
 def series_row(series: Series) -> list:
     """Return a row of the table: the results of a series with their standard errors."""
-    quantities = [with_error(f, series) for f in (magnetisation, specific_heat)]
-    quantities.append(tuple(lt.magnetism.binder_cumulant(series.magnetisation_vectors)))
+    cumulant = lt.magnetism.binder_cumulant(series.magnetisation_vectors)
+    quantities = [*(with_error(f, series) for f in (magnetisation, specific_heat)), tuple(cumulant)]
     times = series.autocorrelation_time * series.steps_per_row
     return [series.generator, series.length, f"{series.temperature:g}", series.steps, times, *sum(quantities, ())]
 

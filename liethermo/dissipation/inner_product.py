@@ -55,7 +55,9 @@ class InnerProductDissipation(BracketDissipation):
     --------
     >>> g = mf.so(3)
     >>> form = lt.InnerProductDissipation(np.diag([1.0, 1.0, 2.0]))
-    >>> system = lt.LiePoissonSystem(g, lt.Quadratic([1.0, 2.0, 3.0]), g.casimirs(2)[0], form)
+    >>> system = lt.LiePoissonSystem(
+    ...     g, lt.Quadratic([1.0, 2.0, 3.0]), g.casimirs(2)[0], form
+    ... )
     >>> bool(system.check().passed)
     True
     """
@@ -105,7 +107,9 @@ class KillingDissipation(BracketDissipation):
     Examples
     --------
     >>> g = mf.so(3)
-    >>> system = lt.LiePoissonSystem(g, lt.Quadratic([1.0, 2.0, 3.0]), g.casimirs(2)[0], lt.KillingDissipation(0.1))
+    >>> system = lt.LiePoissonSystem(
+    ...     g, lt.Quadratic([1.0, 2.0, 3.0]), g.casimirs(2)[0], lt.KillingDissipation(0.1)
+    ... )
     >>> bool(system.check().passed)
     True
     """

@@ -47,7 +47,9 @@ class LindbladJumps(Dissipation):
     --------
     >>> lower = np.array([[0, 1], [0, 0]])
     >>> qubit = lt.QuantumSystem(np.diag([0.0, 1.0]), lt.LindbladJumps([(lower, 0.2)]))
-    >>> run = lt.integrate(qubit, qubit.state([0.0, 1.0]), (0.0, 5.0), 0.1, lt.MetriplecticGauss(3))
+    >>> run = lt.integrate(
+    ...     qubit, qubit.state([0.0, 1.0]), (0.0, 5.0), 0.1, lt.MetriplecticGauss(3)
+    ... )
     >>> excited = qubit.density(run.x[-1])[1, 1].real
     >>> bool(abs(excited - np.exp(-0.2 * 5.0)) < 1e-10)
     True

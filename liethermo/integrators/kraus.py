@@ -54,7 +54,9 @@ class KrausMethod(OneStepMethod):
     --------
     >>> lower = np.array([[0, 1], [0, 0]])
     >>> qubit = lt.QuantumSystem(np.diag([0.0, 1.0]), lt.LindbladJumps([(lower, 0.2)]))
-    >>> run = lt.integrate(qubit, qubit.state([0.0, 1.0]), (0.0, 60.0), 6.0, lt.KrausMethod(4))
+    >>> run = lt.integrate(
+    ...     qubit, qubit.state([0.0, 1.0]), (0.0, 60.0), 6.0, lt.KrausMethod(4)
+    ... )
     >>> bool(np.linalg.eigvalsh(qubit.density(run.x)).min() > -1e-15), run.audit().passed
     (True, True)
     """

@@ -145,8 +145,13 @@ def principal_axes(inertia) -> PrincipalAxes:
 
     Examples
     --------
-    >>> moments, axes = lt.bodies.principal_axes([[2.0, 0.0, 0.0], [0.0, 2.5, 0.5], [0.0, 0.5, 2.5]])
-    >>> np.allclose(moments, [2.0, 2.0, 3.0]), np.allclose(np.abs(axes[:, 2]), [0.0, 0.5**0.5, 0.5**0.5])
+    >>> moments, axes = lt.bodies.principal_axes(
+    ...     [[2.0, 0.0, 0.0], [0.0, 2.5, 0.5], [0.0, 0.5, 2.5]]
+    ... )
+    >>> (
+    ...     np.allclose(moments, [2.0, 2.0, 3.0]),
+    ...     np.allclose(np.abs(axes[:, 2]), [0.0, 0.5**0.5, 0.5**0.5]),
+    ... )
     (True, True)
     """
     tensors = np.asarray(checked_numbers(inertia, "inertia"), dtype=np.float64)

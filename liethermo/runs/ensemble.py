@@ -127,7 +127,9 @@ def ensemble(
     Examples
     --------
     >>> starts = np.random.default_rng(0).standard_normal((100, 3))
-    >>> many = lt.ensemble(lt.models.rigid_body(rate=0.2), starts, (0.0, 5.0), 0.05, outputs="summary")
+    >>> many = lt.ensemble(
+    ...     lt.models.rigid_body(rate=0.2), starts, (0.0, 5.0), 0.05, outputs="summary"
+    ... )
     >>> many.energy.shape, bool(many.ok.all())
     ((100,), True)
     """

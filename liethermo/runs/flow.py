@@ -110,12 +110,21 @@ def flow(
     Examples
     --------
     >>> def end(rate):
-    ...     return lt.flow(lt.models.rigid_body(rate=rate), jnp.array([0.1, 1.0, 0.1]), (0.0, 1.0), 0.1)
+    ...     return lt.flow(
+    ...         lt.models.rigid_body(rate=rate), jnp.array([0.1, 1.0, 0.1]), (0.0, 1.0), 0.1
+    ...     )
     >>> jax.jacfwd(end)(0.5).shape
     (3,)
     >>> times = jnp.array([0.13, 0.5, 0.77])
     >>> body = lt.models.rigid_body()
-    >>> lt.flow(body, [0.1, 1.0, 0.1], (0.0, 1.0), 0.1, save_at=times, parameters={"dissipation.rate": 0.5}).shape
+    >>> lt.flow(
+    ...     body,
+    ...     [0.1, 1.0, 0.1],
+    ...     (0.0, 1.0),
+    ...     0.1,
+    ...     save_at=times,
+    ...     parameters={"dissipation.rate": 0.5},
+    ... ).shape
     (3, 3)
     """
     method = DEFAULT_METHOD if method is None else method

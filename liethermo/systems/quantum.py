@@ -102,7 +102,9 @@ class QuantumSystem(System):
     --------
     >>> lower = np.array([[0, 1], [0, 0]])
     >>> bath = lt.HeatBaths(capacity=0.5, temperature=0.2)
-    >>> qubit = lt.QuantumSystem(np.diag([0.0, 1.0]), lt.ThermalJumps([(lower, 0.05)]), baths=bath)
+    >>> qubit = lt.QuantumSystem(
+    ...     np.diag([0.0, 1.0]), lt.ThermalJumps([(lower, 0.05)]), baths=bath
+    ... )
     >>> run = lt.integrate(qubit, qubit.state([[0.1, 0.25], [0.25, 0.9]]), (0.0, 10.0), 0.1)
     >>> qubit.density(run.x[-1]).shape, run.audit().passed
     ((2, 2), True)

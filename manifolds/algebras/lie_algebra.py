@@ -67,7 +67,10 @@ class LieAlgebra(StructureMethods):
     Examples
     --------
     >>> C = np.zeros((3, 3, 3))
-    >>> C[0, 1, 2], C[0, 2, 1] = 1, -1  # [e1, e2] = e3, [e1, e3] = -e2: the motions of the plane
+    >>> C[0, 1, 2], C[0, 2, 1] = (
+    ...     1,
+    ...     -1,
+    ... )  # [e1, e2] = e3, [e1, e3] = -e2: the motions of the plane
     >>> g = mf.LieAlgebra.from_structure_constants(C - C.swapaxes(0, 1), name="plane")
     >>> print(*g.casimirs(degree=2))
     mu2**2 + mu3**2
@@ -172,7 +175,9 @@ class LieAlgebra(StructureMethods):
 
         Examples
         --------
-        >>> g = mf.LieAlgebra.from_brackets({("e2", "e4"): "e1", ("e3", "e4"): {"e2": 1}}, name="A4,1")
+        >>> g = mf.LieAlgebra.from_brackets(
+        ...     {("e2", "e4"): "e1", ("e3", "e4"): {"e2": 1}}, name="A4,1"
+        ... )
         >>> print(*g.casimirs(max_degree=2), sep=", ")
         e1, 2*e1*e3 - e2**2
         """
