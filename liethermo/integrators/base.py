@@ -22,6 +22,7 @@ from ..functions.energy import Energy
 from ..functions.gradients import EPS, DiscreteGradient, two_sum
 from ..functions.rounding import value_and_rounding_scale
 from ..systems import System
+from ..systems.conservation import dissipation_keeps_casimirs
 from .levels import project_implicit_step
 from .tableaus import MAX_STAGES, extrapolation_matrix, gauss_tableau, interpolation_weights, start_slope_weights
 
@@ -176,7 +177,7 @@ class OneStepMethod(Module):
         ):  # every discrete gradient is that of a collocation polynomial
             return bool(self.preserves & {"casimirs", "quadratic_casimirs"})
         if "quadratic_casimirs" in self.preserves:
-            force_keeps_casimirs = system.dissipation_keeps_casimirs
+            force_keeps_casimirs = dissipation_keeps_casimirs(system)
             return casimir and quadratic and force_keeps_casimirs
         return casimir and "casimirs" in self.preserves
 

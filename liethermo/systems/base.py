@@ -73,9 +73,22 @@ class System(SystemInterface):
 
     @with_library_settings
     def _build(
-        self, poisson, dim, energy, entropy, dissipation, momentum_maps, validate, space=None, baths=None
+        self,
+        poisson,
+        dim,
+        energy,
+        entropy,
+        dissipation,
+        momentum_maps,
+        validate,
+        space=None,
+        baths=None,
+        check_poisson: bool = True,
     ) -> None:
-        """Check and set the common attributes; constructors of subclasses call it after they have set their own."""
+        """Check and set the common attributes; constructors of subclasses call it after they have set their own.
+
+        Without ``check_poisson`` an expensive check is skipped, because Pi is a Poisson tensor by construction.
+        """
         if not isinstance(baths, HeatBaths | None):
             raise InputError(f"baths are lt.HeatBaths(...), not {type(baths).__name__}")
         self.dim, self.space = dim, space
@@ -126,7 +139,7 @@ class System(SystemInterface):
         if self.preserved and not is_traced(self):
             self.preserved_labels = find_preserved_names(self)
         if validate and not is_traced(self):
-            require_axioms(self, matrices=not self.has_poisson_by_construction)
+            require_axioms(self, matrices=check_poisson)
 
     def drop_baths(self) -> System:
         if self.baths is None:

@@ -37,7 +37,7 @@ from .conditions import RunCondition
 from .density_states import checked_density_matrices, checked_parts, join_baths, tensor_with_identity
 from .equilibria import Equilibrium, steady_state
 from .hamiltonian import hamiltonian_energy
-from .interface import InvariantVerdicts
+from .interface import EngineHints, InvariantVerdicts
 from .invariants import systems_at_test_times
 from .states import evaluate_batch
 
@@ -424,7 +424,9 @@ class QuantumSystem(System):
     def _has_dissipation(self, kind: type[Dissipation]) -> bool:
         return self.dissipation is not None and any(isinstance(term, kind) for term in self.dissipation.terms)
 
-    has_matrix_functions = True
+    @property
+    def hints(self) -> EngineHints:
+        return super().hints._replace(has_matrix_functions=True)
 
     # -- heat ---------------------------------------------------------------------------------------------------------
 
