@@ -31,7 +31,7 @@ from .conservation import project_covector
 from .interface import SystemInterface
 from .invariants import find_invariants, find_preserved_names, named_functions
 from .states import checked_state_array, evaluate_batch, reshape_to_sites
-from .transport import dissipation_velocities
+from .transport import dissipation_velocities, generator_field, has_generator
 
 
 class System(SystemInterface):
@@ -321,8 +321,8 @@ class System(SystemInterface):
         return check_system(self, points, samples, seed, scale, times)
 
     def _vector_field(self, x) -> jax.Array:
-        if self.has_generator:
-            return self.generator_field(x)
+        if has_generator(self):
+            return generator_field(self, x)
         dS = jnp.zeros_like(x) if self.entropy is None else self.entropy.gradient(x)
         gradients = self.energy.gradient(x), dS, *(L.gradient(x) for L in self.preserved)
         dH, dS, *dL = (project_covector(self, x, alpha) for alpha in gradients)

@@ -132,17 +132,6 @@ class SystemInterface(Geometry):
         """Return the gradient of the entropy at x, shape (n,); None without an entropy."""
         return None if self.entropy is None else self.entropy.gradient(x)
 
-    @property
-    def has_generator(self) -> bool:
-        """True if :meth:`generator_field` computes the motion without the gradient of the entropy."""
-        return self.dissipation is not None and self.dissipation.has_generator
-
-    def generator_field(self, x) -> jax.Array:
-        """Return the vector field at x, shape (n,), in the form that does not contain the entropy."""
-        assert self.dissipation is not None
-        dH = self.energy.gradient(x)
-        return self.poisson.sharp(x, dH) + self.dissipation.generator_field(self, x, dH)
-
     def samples(self, count: int, seed: int = 0, scale: float = 1.0) -> np.ndarray:
         """Return random states, shape (count, n): normal with standard deviation ``scale``, or points of the space."""
         if self.space is None:

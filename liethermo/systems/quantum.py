@@ -40,6 +40,7 @@ from .hamiltonian import hamiltonian_energy
 from .interface import EngineHints, InvariantVerdicts
 from .invariants import systems_at_test_times
 from .states import evaluate_batch
+from .transport import has_generator
 
 LINDBLAD_EIGENVALUE_LIMIT = 1e-6
 """Largest modulus of a negative eigenvalue under Lindblad's equation alone, whose steps have errors of their order. The
@@ -384,7 +385,7 @@ class QuantumSystem(System):
         if not grows.size:
             return ""
         eigenvalue = np.linalg.eigvalsh(rho[use[grows[0]]])[0]
-        otherwise = ", or take lt.MetriplecticRungeKutta, whose stages are without it" if self.has_generator else ""
+        otherwise = ", or take lt.MetriplecticRungeKutta, whose stages are without it" if has_generator(self) else ""
         return (
             f"its density matrix has the eigenvalue {eigenvalue:.3g}, which jumps make larger, where the gradient of "
             f"the entropy is infinite: mix it, as in q.state(rho, mixed=1e-6){otherwise}"
