@@ -86,7 +86,10 @@ class MetriplecticRungeKutta(ExplicitMethod):
     --------
     >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
     >>> method = lt.MetriplecticRungeKutta(order=4)
-    >>> method.explicit, lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 10.0), 0.1, method).audit().passed
+    >>> (
+    ...     method.explicit,
+    ...     lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 10.0), 0.1, method).audit().passed,
+    ... )
     (True, True)
     """
 

@@ -67,7 +67,9 @@ class MetriplecticTaylor(ExplicitMethod):
     Examples
     --------
     >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
-    >>> run = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 100.0), lt.Adaptive(1e-12), lt.MetriplecticTaylor())
+    >>> run = lt.integrate(
+    ...     body, [0.1, 0.2, 1.0], (0.0, 100.0), lt.Adaptive(1e-12), lt.MetriplecticTaylor()
+    ... )
     >>> run.audit().passed, run.stats.steps < 300
     (True, True)
     """

@@ -110,12 +110,21 @@ def flow(
     Examples
     --------
     >>> def end(rate):
-    ...     return lt.flow(lt.models.rigid_body(rate=rate), jnp.array([0.1, 1.0, 0.1]), (0.0, 1.0), 0.1)
+    ...     return lt.flow(
+    ...         lt.models.rigid_body(rate=rate), jnp.array([0.1, 1.0, 0.1]), (0.0, 1.0), 0.1
+    ...     )
     >>> jax.jacfwd(end)(0.5).shape
     (3,)
     >>> times = jnp.array([0.13, 0.5, 0.77])
     >>> body = lt.models.rigid_body()
-    >>> lt.flow(body, [0.1, 1.0, 0.1], (0.0, 1.0), 0.1, save_at=times, parameters={"dissipation.rate": 0.5}).shape
+    >>> lt.flow(
+    ...     body,
+    ...     [0.1, 1.0, 0.1],
+    ...     (0.0, 1.0),
+    ...     0.1,
+    ...     save_at=times,
+    ...     parameters={"dissipation.rate": 0.5},
+    ... ).shape
     (3, 3)
     """
     method = DEFAULT_METHOD if method is None else method
@@ -124,7 +133,7 @@ def flow(
     if save_at is not None and save_every is not None:
         raise InputError("flow takes save_at or save_every, got both. Remove one of them")
     save_every = 1 if save_at is not None else save_every
-    x, declared = system.state(x0), DeclaredTimes.of_tree(system)
+    x, declared = system.state(x0), DeclaredTimes.from_tree(system)
     schedule = make_schedule(t_span, step, save_every, breaks=breaks, declared=declared)
     times = None if save_at is None else checked_save_times(save_at, schedule)
     n, user_system = system.dim, system

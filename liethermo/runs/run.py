@@ -139,7 +139,7 @@ class Run:
             StatusCode.COMPLETED, f"reached t = {self.schedule.end:g} in 0 steps", 0, self.schedule.end
         )
 
-    def run_with_step_control(self, bar, step: float | Adaptive, until) -> None:
+    def run_adaptive_or_until_event(self, bar, step: float | Adaptive, until) -> None:
         """Take adaptive steps, or steps of a given size with events; every step is examined."""
         start, end, save_every = self.schedule.start, self.schedule.end, self.schedule.save_every or 1
         saves_at_stops, stops = self.schedule.save_every is None, self.schedule.stop_times

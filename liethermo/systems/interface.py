@@ -177,8 +177,8 @@ class SystemInterface(Geometry):
         ----------
         x : array, shape (m, n)
             States of the run.
-        t : array, shape (m,)
-            Their times.
+        t : array, shape (k,)
+            Times of the run, such as those of the states.
         guarantees : frozenset of str
             What the method keeps to rounding: see :class:`liethermo.integrators.base.Guarantee`.
         """

@@ -302,7 +302,8 @@ class CompiledStepLoop:
         self._newton_code: MachineCode | None = None
         self._structures = structures
         system = structures[0].build(parameters[: structures[0].n_parameters])
-        n, slopes_shape = system.dim, jax.eval_shape(lambda x: method.start(system, x), jnp.zeros(system.dim)).shape
+        n, state = system.dim, jax.ShapeDtypeStruct((system.dim,), np.float64)
+        slopes_shape = jax.eval_shape(lambda x: method.start(system, x), state).shape
         self._shapes: dict[str, tuple[int, ...]] = {
             "x": (n,),
             "compensation": (n,),

@@ -69,6 +69,7 @@ def body_with_undeclared_pulses():
     return lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1.0 / INERTIA), torque=undeclared_pulses)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("method", "step", "max_error"), METHODS, ids=str)
 def test_thruster_pulses_are_integrated_to_the_tolerance(body, reference, method, step, max_error):
     solution = lt.integrate(body, X0, (0.0, END), step, method)
@@ -150,6 +151,7 @@ def switched_reference():
     return m, work
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("is_right_continuous", [True, False])
 @pytest.mark.parametrize(
     ("method", "step", "max_error"),
@@ -249,6 +251,7 @@ def test_smooth_drives_have_no_features():
 # -- errors of quadratures ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("frequency", [1.0, 10.0])
 @pytest.mark.parametrize(
     "method", [*map(lt.MetriplecticRungeKutta, (4, 6, 8)), lt.MetriplecticTaylor(), lt.MetriplecticGauss(3)], ids=str
@@ -326,10 +329,10 @@ def test_steps_end_at_the_times_of_a_linear_table(reference_with_table, method, 
 def test_a_step_across_a_kink_would_lose_the_order(reference_with_table):
     """The control: the same values as a function that declares nothing."""
 
-    def undeclared(t, m):
+    def torque(t, m):
         return jnp.stack([jnp.interp(t, KNOTS, column) for column in MOMENTS.T])
 
-    body = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1.0 / INERTIA), torque=undeclared)
+    body = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1.0 / INERTIA), torque=torque)
     run = lt.integrate(body, X0, (0.0, END), lt.Adaptive(1e-9), lt.MetriplecticRungeKutta(8))
     assert np.abs(run.x[-1] - reference_with_table).max() > 1e-8
 

@@ -13,6 +13,7 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.systems.driven import CLOCK_UNIT, DrivenSystem
 from liethermo.tracing.interpret import evaluate_at_points
+from tests.refusals import refusal_test
 
 RATE = 1.3
 SPAN = (0.5, 3.5)
@@ -436,30 +437,25 @@ def test_functions_held_by_the_method_and_stiff_steps():
         assert run.audit(energy=1e-12).passed, run.audit()
 
 
-@pytest.mark.parametrize(
-    ("build", "words"),
-    [
-        (
-            lambda: lt.MetriplecticSystem(None, still, lambda x, t: t * x[0], dim=2),
-            "the entropy must be a function of the state alone",
-        ),
-        (
-            lambda: lt.MetriplecticSystem(None, still, momentum_maps={"J": shaken}, dim=2),
-            "momentum map 'J' must be a function of the state alone",
-        ),
-        (lambda: lt.MetriplecticSystem(None, lambda x, t: t * x, dim=2), r"shape \(2,\)"),
-        (lambda: lt.MetriplecticSystem(None, lt.TimeDependent(lambda x, t: x[7] * t).on([7]), dim=2), "component 7"),
-        (
-            lambda: lt.ThermodynamicHerglotz(lambda x, t: x[1] ** 2 - x[0] * t, dim=3),
-            "the Lagrangian must be a function of the state alone",
-        ),
-        (lambda: lt.SimpleClosedSystem(lambda q, v, S, t: v @ v - S * t, dim=3), "external"),
-        (lambda: lt.Subsystem(shaken, 3), "the energy of a subsystem must be a function of the state alone"),
-        (lambda: SHAKEN.energy(np.ones(2)), r"energy\(x, t\)"),
-        (lambda: lt.integrate(SHAKEN, [1.0, 0.0], SPAN, 0.1, lt.VariationalGauss(2)), "Metriplectic.* depends on time"),
-        (lambda: lt.integrate(SHAKEN, [1.0, 0.0, 0.5], SPAN, 0.1), r"shape \(2,\)"),
-    ],
+test_what_is_refused = refusal_test(
+    (
+        lambda: lt.MetriplecticSystem(None, still, lambda x, t: t * x[0], dim=2),
+        "the entropy must be a function of the state alone",
+    ),
+    (
+        lambda: lt.MetriplecticSystem(None, still, momentum_maps={"J": shaken}, dim=2),
+        "momentum map 'J' must be a function of the state alone",
+    ),
+    (lambda: lt.MetriplecticSystem(None, lambda x, t: t * x, dim=2), r"shape \(2,\)"),
+    (lambda: lt.MetriplecticSystem(None, lt.TimeDependent(lambda x, t: x[7] * t).on([7]), dim=2), "component 7"),
+    (
+        lambda: lt.ThermodynamicHerglotz(lambda x, t: x[1] ** 2 - x[0] * t, dim=3),
+        "the Lagrangian must be a function of the state alone",
+    ),
+    (lambda: lt.SimpleClosedSystem(lambda q, v, S, t: v @ v - S * t, dim=3), "external"),
+    (lambda: lt.Subsystem(shaken, 3), "the energy of a subsystem must be a function of the state alone"),
+    (lambda: SHAKEN.energy(np.ones(2)), r"energy\(x, t\)"),
+    (lambda: lt.integrate(SHAKEN, [1.0, 0.0], SPAN, 0.1, lt.VariationalGauss(2)), "Metriplectic.* depends on time"),
+    (lambda: lt.integrate(SHAKEN, [1.0, 0.0, 0.5], SPAN, 0.1), r"shape \(2,\)"),
+    error=(lt.InputError, lt.FunctionError),
 )
-def test_what_is_refused(build, words):
-    with pytest.raises((lt.InputError, lt.FunctionError), match=words):
-        build()
