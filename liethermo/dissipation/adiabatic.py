@@ -11,6 +11,7 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced
+from manifolds._pytree_module import replace_fields
 from manifolds.matrices.linear import adjoint
 from manifolds.matrices.spectral import ordered_eigenvectors
 
@@ -116,7 +117,7 @@ class AdiabaticJumps(ThermalJumps):
             hamiltonians = system.hamiltonians()
             groups = _pair_groups(hamiltonians)
             self._check_rates_at_zero(hamiltonians)
-        return self._replace_fields(pair_groups=Indices(groups))
+        return replace_fields(self, pair_groups=Indices(groups))
 
     def _check_rates_at_zero(self, hamiltonians: list[np.ndarray]) -> None:
         """Raise InputError if a rate is infinite at omega = 0, and the coupling has a component of this frequency."""

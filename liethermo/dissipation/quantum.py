@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Sequence
@@ -15,6 +14,7 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced
+from manifolds._pytree_module import replace_fields
 from manifolds.matrices.linear import adjoint
 from manifolds.matrices.spectral import log_mean
 
@@ -153,8 +153,8 @@ class ThermalJumps(Dissipation):
         if baths is None:
             jumps = tuple(Jump(V, i, 0.5 if is_hermitian(V) else 1.0) for i, V in enumerate(self.operators))
             conserves_energy = all(is_commuting(H, V) for H in hamiltonians for V in map(np.asarray, self.operators))
-            return self._replace_fields(
-                jumps=jumps, jump_frame=None, is_isolated=True, conserves_energy=conserves_energy
+            return replace_fields(
+                self, jumps=jumps, jump_frame=None, is_isolated=True, conserves_energy=conserves_energy
             )
         vectors = _common_eigenvectors(hamiltonians)
         jumps_by_coupling = [_jumps_of_coupling(V, i, hamiltonians, vectors) for i, V in enumerate(self.operators)]
@@ -162,8 +162,14 @@ class ThermalJumps(Dissipation):
         jumps = tuple(itertools.chain.from_iterable(jumps_by_coupling))
         levels = np.diag(adjoint(vectors) @ subtract_common_energy(hamiltonians[0]) @ vectors).real
         order, driven = tuple(int(i) for i in np.argsort(levels)), system.is_driven
-        bound_jumps = self._replace_fields(
-            jumps=jumps, jump_frame=frame, level_order=order, is_driven=driven, is_isolated=False, conserves_energy=True
+        bound_jumps = replace_fields(
+            self,
+            jumps=jumps,
+            jump_frame=frame,
+            level_order=order,
+            is_driven=driven,
+            is_isolated=False,
+            conserves_energy=True,
         )
         if not is_traced((self.rates, baths)):
             bound_jumps._check_rates(system, hamiltonians[0])
@@ -185,16 +191,9 @@ class ThermalJumps(Dissipation):
             )
         return structure
 
-    def _replace_fields(self, **fields):
-        """Return a copy with some fields replaced."""
-        copy = object.__new__(type(self))
-        for field in dataclasses.fields(self):
-            object.__setattr__(copy, field.name, fields.get(field.name, getattr(self, field.name)))
-        return copy
-
     def replace_operators(self, matrices: Sequence[Any], bath: int) -> ThermalJumps:
         """Return jumps with these matrices, for example of a larger system, another bath, and unchanged rates."""
-        return self._replace_fields(operators=tuple(map(Operator, matrices)), bath=bath, jumps=())
+        return replace_fields(self, operators=tuple(map(Operator, matrices)), bath=bath, jumps=())
 
     def force(self, system, x, dH, dS, dL):
         """Return the force; for exact gradients it is Lindblad's equation, without the logarithm of rho.

@@ -209,7 +209,7 @@ class EngineWithFallback:
                     f"the sparse engine cannot run a {system.kind} that does not know its sparsity. Build the system "
                     "as a ComposedSystem of lt.Copies joined by lt.Each"
                 )
-        repays_compiling = self.planned_steps >= MIN_STEPS_TO_COMPILE or system.has_matrix_functions
+        repays_compiling = self.planned_steps >= MIN_STEPS_TO_COMPILE or system.hints.has_matrix_functions
         if self.requested_engine == "compiled" or (is_auto and is_worth_compiling(system)):
             compiled = CompiledEngine(system, method, planned_steps=self.planned_steps)
             try:
@@ -274,7 +274,7 @@ class Trajectory:
 
 def is_worth_compiling(system: System) -> bool:
     """Return whether compiling a system may pay off: it can be unrolled, has few components, and runs on the CPU."""
-    return system.can_unroll and system.dim <= MAX_COMPILED_DIM and jax.default_backend() == "cpu"
+    return system.hints.can_unroll and system.dim <= MAX_COMPILED_DIM and jax.default_backend() == "cpu"
 
 
 def warn_of_fallback(error: UnsupportedPrimitive) -> None:

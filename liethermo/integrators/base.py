@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import functools
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from typing import ClassVar
@@ -22,6 +23,8 @@ from ..functions.energy import Energy
 from ..functions.gradients import EPS, DiscreteGradient, two_sum
 from ..functions.rounding import value_and_rounding_scale
 from ..systems import System
+from ..systems.conservation import dissipation_keeps_casimirs
+from ..systems.transport import generator_field
 from .levels import project_implicit_step
 from .tableaus import MAX_STAGES, extrapolation_matrix, gauss_tableau, interpolation_weights, start_slope_weights
 
@@ -176,7 +179,7 @@ class OneStepMethod(Module):
         ):  # every discrete gradient is that of a collocation polynomial
             return bool(self.preserves & {"casimirs", "quadratic_casimirs"})
         if "quadratic_casimirs" in self.preserves:
-            force_keeps_casimirs = system.dissipation_keeps_casimirs
+            force_keeps_casimirs = dissipation_keeps_casimirs(system)
             return casimir and quadratic and force_keeps_casimirs
         return casimir and "casimirs" in self.preserves
 
@@ -364,7 +367,9 @@ def generator_residual_jvp(system: System, slopes_to_stage_states: Callable, k) 
     The slopes differ from that field only by the corrections of their gradients, which are of the order of the method.
     Its derivative contains no eigenvectors.
     """
-    return jax.linearize(lambda k: jax.vmap(system.generator_field)(slopes_to_stage_states(k)) - k, k)[1]
+    return jax.linearize(
+        lambda k: jax.vmap(functools.partial(generator_field, system))(slopes_to_stage_states(k)) - k, k
+    )[1]
 
 
 def collocation_error_estimate(system: System, x, compensation, h, k) -> jax.Array:

@@ -18,6 +18,7 @@ from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.gradients import EPS
 from ..systems import ChartSystem, System, TurningSystem
+from ..systems.transport import generator_field, has_generator
 from .base import OneStepMethod, TransportingMethod
 from .charts import InCharts, wrap_in_charts
 from .levels import (
@@ -223,7 +224,7 @@ class ExplicitMethod(TransportingMethod):
         leaf, n, skip_law_rates = (
             self._can_follow_symplectic_leaf(system),
             x.shape[0],
-            system.has_generator or system.dissipation is None,
+            has_generator(system) or system.dissipation is None,
         )
         laws = self._laws(system, leaf)
         start_gradients = [law.function.gradient(x + compensation) for law in laws]
@@ -261,7 +262,7 @@ class ExplicitMethod(TransportingMethod):
 
         d, residual = (
             self._project_conserved_first(laws, x, compensation, displacement_on_levels_and_residual)
-            if system.has_generator
+            if has_generator(system)
             else displacement_on_levels_and_residual(laws)
         )
         return jnp.stack(
@@ -335,8 +336,8 @@ class ExplicitMethod(TransportingMethod):
         If the field has a form without the entropy, the rates are not needed and zero.
         """
         system = system.freeze_at(x)
-        if system.has_generator:
-            return system.generator_field(x), jnp.zeros(len(laws))
+        if has_generator(system):
+            return generator_field(system, x), jnp.zeros(len(laws))
         dH = system.energy.gradient(x)
         if system.dissipation is None:
             return system.field(x, dH, jnp.zeros_like(x)), jnp.zeros(len(laws))

@@ -98,10 +98,11 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
             for B, w in factors_and_inputs
             if B.spin_coefficients is not None
         ]
-        if not rotations or not system.can_solve_rotations:
+        if not rotations:
             return slope[None]
         # Solve for the rotation by noise at once: among many spins some rotate far, and the iteration would be slow.
-        return (k[0] + system.solve_rotation(0.5 * h * sum(rotations), slope - k[0]))[None]
+        change = system.solve_rotation(0.5 * h * sum(rotations), slope - k[0])
+        return (slope if change is None else k[0] + change)[None]
 
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
         z, dH, dS, dL = self.method.midpoint_gradients(system, x, compensation, h, k)

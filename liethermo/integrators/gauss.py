@@ -23,6 +23,7 @@ from ..functions.frames import gram_schmidt
 from ..functions.gradients import stage_gradients
 from ..systems import System
 from ..systems.invariants import preserved_by_name, preserved_names, stack_gradients
+from ..systems.transport import has_generator
 from ..tracing.interpret import evaluate_at_points
 from .base import (
     GaussMethod,
@@ -361,7 +362,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         return jax.vmap(lambda point: jnp.stack([sharp(point, J.gradient(point)) for J in maps]))(u)
 
     def residual_jvp(self, system: System, x, compensation, h, k) -> Callable:
-        if not system.has_generator:
+        if not has_generator(system):
             return super().residual_jvp(system, x, compensation, h, k)
         return generator_residual_jvp(system, lambda k: self._stage_states(x, compensation, h, k), k)
 

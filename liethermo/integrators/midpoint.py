@@ -12,6 +12,7 @@ from manifolds._pytree_module import forward_to
 
 from ..functions.gradients import DiscreteGradient, get_discrete_gradient
 from ..systems import System
+from ..systems.transport import has_generator
 from .base import OneStepMethod, TransportingMethod, collocation_error_estimate, generator_residual_jvp, register
 from .charts import wrap_in_charts
 
@@ -88,7 +89,7 @@ class MetriplecticMidpoint(TransportingMethod):
         return True
 
     def residual_jvp(self, system: System, x, compensation, h, k) -> Callable:
-        if not system.has_generator:
+        if not has_generator(system):
             return super().residual_jvp(system, x, compensation, h, k)
         return generator_residual_jvp(system, lambda k: x + (compensation + 0.5 * h * k), k)
 

@@ -14,6 +14,7 @@ import manifolds as mf
 from ..errors import InputError
 from ..systems import System
 from ..systems.clock import error_of_step
+from ..systems.transport import has_generator
 from ..tracing.taylor import TaylorSeriesError, check_taylor_series, increment_taylor_coefficients
 from .base import OneStepMethod, register
 from .charts import resolve_retraction
@@ -111,7 +112,7 @@ class MetriplecticTaylor(ExplicitMethod):
         super().check(system)
         x = jnp.asarray(system.samples(1)[0])
         functions = {"the energy": system.energy.value, "the vector field": system.vector_field}
-        if system.entropy is not None and system.dissipation is not None and not system.has_generator:
+        if system.entropy is not None and system.dissipation is not None and not has_generator(system):
             functions["the entropy"] = system.entropy.value
         for name, function in functions.items():
             try:

@@ -18,6 +18,7 @@ from manifolds._pytree_module import Module
 from ..errors import InputError
 from ..functions.energy import Energy, Pullback, Sum
 from ..systems.base import System
+from ..systems.interface import EngineHints
 from ..tracing.programs import jit_unoptimised
 from .articulated_bodies import ArticulatedBodies, JointDamping, JointSprings, KineticEnergy, Motion
 from .parameters import checked_finite
@@ -78,8 +79,8 @@ class TreeSystem(System):
         return kinetic.mechanism
 
     @property
-    def can_unroll(self) -> bool:
-        return self.mechanism.n_joints <= MAX_UNROLLED_JOINTS
+    def hints(self) -> EngineHints:
+        return super().hints._replace(can_unroll=self.mechanism.n_joints <= MAX_UNROLLED_JOINTS)
 
     @with_library_settings
     def mass_matrix(self, q) -> jax.Array:

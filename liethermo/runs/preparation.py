@@ -30,6 +30,7 @@ from ..systems import (
 from ..systems.attitude import driven_system_or_none
 from ..systems.clock import WORK_NAME
 from ..systems.invariants import recorded_invariants, resolve_invariants_near, undecided_functions
+from ..systems.transport import has_generator
 from ..tracing.caching import LRUCache, memoize
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import is_library_object
@@ -150,7 +151,7 @@ def checked_initial_state(system: System, method, x0, t: float, attitude=None) -
 
 def why_not_startable(system: System, method, x) -> str:
     """Return why no run can start at x, a state or a batch of states; "" if it can."""
-    ignores_singularity = system.has_generator and (not isinstance(method, OneStepMethod) or method.explicit)
+    ignores_singularity = has_generator(system) and (not isinstance(method, OneStepMethod) or method.explicit)
     reason = system.outside(x) or ("" if ignores_singularity else system.why_singular(x))
     return reason and f"the run cannot start at this x0: {reason}"
 

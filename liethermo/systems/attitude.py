@@ -21,6 +21,7 @@ from ..tracing.interpret import evaluate_at_points
 from .base import System
 from .clock import Clock
 from .driven import DrivenSystem
+from .interface import EngineHints
 from .lie_poisson import LiePoissonSystem
 from .lifted import LiftedSystem
 from .rotations import attitude_array
@@ -70,12 +71,13 @@ class AttitudeSystem(LiftedSystem):
         self.preserved_labels, self.invariant_verdicts = body.preserved_labels, body.invariant_verdicts
 
     @property
-    def can_unroll(self) -> bool:
+    def hints(self) -> EngineHints:
         series_maps = {"exp": maps.exp, "coadjoint": maps.adjoint_cayley}
         group_maps = {"exp": self.group.exp_map, "coadjoint": self.group.adjoint_cayley_map}
         kind = self.reconstruction
         has_closed_form = kind not in group_maps or group_maps[kind] is not series_maps[kind]
-        return self.body.can_unroll and self._n_real_parts == 1 and has_closed_form
+        hints = super().hints
+        return hints._replace(can_unroll=hints.can_unroll and self._n_real_parts == 1 and has_closed_form)
 
     @property
     def momentum_system(self) -> LiePoissonSystem:

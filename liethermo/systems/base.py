@@ -31,7 +31,7 @@ from .conservation import project_covector
 from .interface import SystemInterface
 from .invariants import find_invariants, find_preserved_names, named_functions
 from .states import checked_state_array, evaluate_batch, reshape_to_sites
-from .transport import dissipation_velocities
+from .transport import dissipation_velocities, generator_field, has_generator
 
 
 class System(SystemInterface):
@@ -73,9 +73,22 @@ class System(SystemInterface):
 
     @with_library_settings
     def _build(
-        self, poisson, dim, energy, entropy, dissipation, momentum_maps, validate, space=None, baths=None
+        self,
+        poisson,
+        dim,
+        energy,
+        entropy,
+        dissipation,
+        momentum_maps,
+        validate,
+        space=None,
+        baths=None,
+        check_poisson: bool = True,
     ) -> None:
-        """Check and set the common attributes; constructors of subclasses call it after they have set their own."""
+        """Check and set the common attributes; constructors of subclasses call it after they have set their own.
+
+        Without ``check_poisson`` an expensive check is skipped, because Pi is a Poisson tensor by construction.
+        """
         if not isinstance(baths, HeatBaths | None):
             raise InputError(f"baths are lt.HeatBaths(...), not {type(baths).__name__}")
         self.dim, self.space = dim, space
@@ -126,7 +139,7 @@ class System(SystemInterface):
         if self.preserved and not is_traced(self):
             self.preserved_labels = find_preserved_names(self)
         if validate and not is_traced(self):
-            require_axioms(self, matrices=not self.has_poisson_by_construction)
+            require_axioms(self, matrices=check_poisson)
 
     def drop_baths(self) -> System:
         if self.baths is None:
@@ -308,8 +321,8 @@ class System(SystemInterface):
         return check_system(self, points, samples, seed, scale, times)
 
     def _vector_field(self, x) -> jax.Array:
-        if self.has_generator:
-            return self.generator_field(x)
+        if has_generator(self):
+            return generator_field(self, x)
         dS = jnp.zeros_like(x) if self.entropy is None else self.entropy.gradient(x)
         gradients = self.energy.gradient(x), dS, *(L.gradient(x) for L in self.preserved)
         dH, dS, *dL = (project_covector(self, x, alpha) for alpha in gradients)

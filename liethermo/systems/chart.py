@@ -11,12 +11,12 @@ from __future__ import annotations
 import jax
 
 import manifolds as mf
-from manifolds._pytree_module import forward_to
 from manifolds.structures.poisson import PoissonBySharp
 
 from ..dissipation.base import LiftedDissipation, LiftedGeometry
 from ..functions.energy import Energy
 from .base import System
+from .interface import EngineHints
 
 
 class ChartSystem(System):
@@ -56,7 +56,9 @@ class ChartSystem(System):
         assert space is not None
         return energy.map_terms(lambda term: term.pullback_to_chart(self.coordinates, space, self.start))
 
-    is_smooth = forward_to("manifold")
+    @property
+    def hints(self) -> EngineHints:
+        return super().hints._replace(is_smooth=self.manifold.hints.is_smooth)
 
     def freeze_at(self, x) -> System:
         if self.place is not None:

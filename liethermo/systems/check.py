@@ -274,9 +274,9 @@ def _matrix_residuals(system: Any, chart_system: Any, x, dH, dS):
     relative: Callable = lambda a, b: a / jnp.where(b > 0.0, b, 1.0)  # noqa: E731
     tensor = system.poisson.tensor(x)
     residuals = {"skew": relative(size(tensor + tensor.T), size(tensor))}
-    if system.is_smooth and chart_system is None and x.size > MAX_FULL_JACOBI_DIM:
+    if system.hints.is_smooth and chart_system is None and x.size > MAX_FULL_JACOBI_DIM:
         residuals["jacobi"] = _sampled_jacobi_residual(system.poisson, x)
-    elif system.is_smooth:
+    elif system.hints.is_smooth:
         poisson = (chart_system or system).poisson
         variation = size(jax.jacfwd(poisson.tensor)(x))
         if chart_system is not None:  # in normal coordinates the derivative may be rounding alone

@@ -69,6 +69,11 @@ def rates_of_change(model: tuple[SystemInterface, tuple[Energy, ...]], x) -> Inv
     return InvariantRates(rates, jnp.where(rates == 0.0, 1.0, scales))
 
 
+def dissipation_keeps_casimirs(system: SystemInterface) -> bool:
+    """Return whether no summand of the dissipation changes a Casimir, by construction."""
+    return all(term.preserves_casimirs for term in system.dissipations)
+
+
 def project_covector(system: SystemInterface, x, alpha) -> jax.Array:
     """Return the part of a covector that acts on tangent vectors: alpha itself on R^n."""
     return alpha if system.space is None else system.lower_index(x, system.raise_index(x, alpha))

@@ -164,10 +164,9 @@ class DrivenSystem(LiftedSystem):
         """Return the system with a fixed torque, shape (body.dim,)."""
         return replace_fields(self, torque=torque)
 
-    can_solve_rotations = forward_to("body")
-
     def solve_rotation(self, angles, v):
-        return jnp.concatenate([self.body.solve_rotation(angles, v[:-2]), v[-2:]])
+        u = self.body.solve_rotation(angles, v[:-2])
+        return None if u is None else jnp.concatenate([u, v[-2:]])
 
     def raise_index(self, x, alpha):
         """Return the direction of a correction along alpha, without components along the clock and the work."""

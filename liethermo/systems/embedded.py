@@ -26,6 +26,7 @@ from ..functions.surface import ConstraintSurface
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.programs import subprogram
 from .base import System
+from .interface import EngineHints
 
 TANGENCY_RTOL = 1e-12
 """Largest component normal to the level sets, relative to the velocity, of a field that counts as tangent to them."""
@@ -120,10 +121,9 @@ class EmbeddedSystem(System):
         return _tangential_part(self.manifold, x, alpha)
 
     @property
-    def can_unroll(self) -> bool:
-        return self.manifold.is_smooth
-
-    is_smooth = forward_to("manifold")
+    def hints(self) -> EngineHints:
+        is_smooth = self.manifold.hints.is_smooth
+        return super().hints._replace(can_unroll=is_smooth, is_smooth=is_smooth)
 
 
 class _TangentPoisson(PoissonBySharp):

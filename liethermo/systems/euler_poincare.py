@@ -20,6 +20,7 @@ from ..functions.checks import checked_energy
 from ..functions.energy import Energy, Quadratic, TimeDependent, make_energy
 from ..functions.inverse_gradient import inverse_gradient
 from ..tracing.interpret import evaluate_at_points
+from .interface import EngineHints
 from .lie_poisson import LiePoissonSystem
 from .states import evaluate_batch
 
@@ -100,8 +101,8 @@ class EulerPoincareSystem(LiePoissonSystem):
         )
 
     @property
-    def can_unroll(self) -> bool:
-        return isinstance(self.energy, Quadratic)  # the others iterate
+    def hints(self) -> EngineHints:
+        return super().hints._replace(can_unroll=isinstance(self.energy, Quadratic))  # the others iterate
 
     def at_time(self, t, attitude=None) -> EulerPoincareSystem:
         system = super().at_time(t, attitude)

@@ -59,7 +59,8 @@ class ContactManifoldSystem(System):
         if self.is_isolated:
             law = nondecreasing_if(is_mechanical(function, dim, space))
             entropy, friction = entropy_component(dim), LiouvilleFriction(law=law)
-        self._build(structure, dim, energy, entropy, friction, momentum_maps, validate, state_space(space))
+        parts = structure, dim, energy, entropy, friction, momentum_maps, validate
+        self._build(*parts, state_space(space), check_poisson=space is None)
 
     def specific_residuals(self, x) -> dict[str, jax.Array]:
         rate = self.vector_field(x)
@@ -84,10 +85,6 @@ class ContactManifoldSystem(System):
     def local_system(self, x, is_centred: bool = False) -> tuple[System, jax.Array]:
         """Return the embedded system, whose field is tangent to the level sets of the constraints, and x."""
         return (self if self.space is None else EmbeddedSystem(self, is_tangent=True)), x
-
-    @property
-    def has_poisson_by_construction(self) -> bool:
-        return self.space is not None
 
     def _vector_field(self, x) -> jax.Array:
         """Return the field without projecting the gradients, whose normal components have no effect."""

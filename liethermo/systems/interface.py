@@ -35,6 +35,24 @@ class InvariantVerdicts(NamedTuple):
         return cls(frozenset(constant), frozenset(name for name, verdict in verdicts.items() if verdict is None))
 
 
+class EngineHints(NamedTuple):
+    """What an engine and a check may rely on in a system.
+
+    Attributes
+    ----------
+    can_unroll : bool
+        Whether the compiled engine is worth trying; False if the system needs a loop.
+    has_matrix_functions : bool
+        Whether the system consists of matrix functions, which XLA compiles more slowly than the compiled engine.
+    is_smooth : bool
+        Whether the vector field is at least twice differentiable.
+    """
+
+    can_unroll: bool = True
+    has_matrix_functions: bool = False
+    is_smooth: bool = True
+
+
 class SystemInterface(Geometry):
     """Data of a kind of system, and methods that a subclass may override.
 
@@ -113,22 +131,6 @@ class SystemInterface(Geometry):
     def entropy_gradient(self, x) -> jax.Array | None:
         """Return the gradient of the entropy at x, shape (n,); None without an entropy."""
         return None if self.entropy is None else self.entropy.gradient(x)
-
-    @property
-    def has_poisson_by_construction(self) -> bool:
-        """True if Pi is a Poisson tensor by construction, so that an expensive check can be skipped."""
-        return False
-
-    @property
-    def has_generator(self) -> bool:
-        """True if :meth:`generator_field` computes the motion without the gradient of the entropy."""
-        return self.dissipation is not None and self.dissipation.has_generator
-
-    def generator_field(self, x) -> jax.Array:
-        """Return the vector field at x, shape (n,), in the form that does not contain the entropy."""
-        assert self.dissipation is not None
-        dH = self.energy.gradient(x)
-        return self.poisson.sharp(x, dH) + self.dissipation.generator_field(self, x, dH)
 
     def samples(self, count: int, seed: int = 0, scale: float = 1.0) -> np.ndarray:
         """Return random states, shape (count, n): normal with standard deviation ``scale``, or points of the space."""
@@ -248,20 +250,15 @@ class SystemInterface(Geometry):
 
     # -- spins ----------------------------------------------------------------------------------------------------
 
-    @property
-    def can_solve_rotations(self) -> bool:
-        """True for a system of spins, whose method ``solve_rotation`` solves for a rotation of every spin at once."""
-        return False
-
-    def solve_rotation(self, angles, v) -> jax.Array:
-        """Return u with ``u_i - angles_i x u_i = v_i`` at each spin, and ``u = v`` elsewhere.
+    def solve_rotation(self, angles, v) -> jax.Array | None:
+        """Return u with ``u_i - angles_i x u_i = v_i`` at each spin, and ``u = v`` elsewhere; None without spins.
 
         Parameters
         ----------
         angles : array, shape (sites, 3)
         v : array, shape (n,)
         """
-        raise NotImplementedError(f"{type(self).__name__} has no spins")
+        return None
 
     # -- laws ---------------------------------------------------------------------------------------------------------
 
@@ -269,11 +266,6 @@ class SystemInterface(Geometry):
     def dissipations(self) -> tuple[Dissipation, ...]:
         """The summands of the dissipation; () without one."""
         return () if self.dissipation is None else self.dissipation.terms
-
-    @property
-    def dissipation_keeps_casimirs(self) -> bool:
-        """True if no summand of the dissipation changes a Casimir, by construction."""
-        return all(term.preserves_casimirs for term in self.dissipations)
 
     @property
     def preserved(self) -> tuple[Energy, ...]:
@@ -340,19 +332,11 @@ class SystemInterface(Geometry):
     # -- for the engines ----------------------------------------------------------------------------------------------
 
     @property
-    def can_unroll(self) -> bool:
-        """True if the compiled engine is worth trying; False if the system needs a loop."""
-        return self.space is None or (self.space.is_smooth and self.space.dtype.kind != "c")
-
-    @property
-    def has_matrix_functions(self) -> bool:
-        """True if the system consists of matrix functions, which XLA compiles more slowly than the compiled engine."""
-        return False
-
-    @property
-    def is_smooth(self) -> bool:
-        """True if the vector field is at least twice differentiable."""
-        return self.space is None or self.space.is_smooth
+    def hints(self) -> EngineHints:
+        """Return what an engine and a check may rely on; by default what the space tells."""
+        is_smooth = self.space is None or self.space.is_smooth
+        is_complex = self.space is not None and self.space.dtype.kind == "c"
+        return EngineHints(can_unroll=is_smooth and not is_complex, is_smooth=is_smooth)
 
     def sparsity_pattern(self) -> scipy.sparse.csr_array | None:
         """Return the sparsity pattern of the Jacobian of the field, shape (n, n), discrete gradients included.

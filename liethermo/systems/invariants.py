@@ -17,7 +17,7 @@ from manifolds._pytree_module import replace_fields
 from ..functions.energy import Energy, function_name
 from ..tracing.caching import memoize
 from ..tracing.interpret import evaluate_at_points
-from .conservation import is_proportional, judge_conservation, rates_of_change
+from .conservation import dissipation_keeps_casimirs, is_proportional, judge_conservation, rates_of_change
 from .interface import InvariantVerdicts, SystemInterface
 
 System = TypeVar("System", bound=SystemInterface)
@@ -168,7 +168,7 @@ def _conservation_verdicts(system: SystemInterface, near=None) -> dict[str, bool
 def invariants_by_construction(system: SystemInterface) -> frozenset[str]:
     """Return the names of the functions that are conserved by construction and need no test."""
     return frozenset(
-        {*system.momentum_maps, *(system.torque_invariant_casimirs if system.dissipation_keeps_casimirs else ())}
+        {*system.momentum_maps, *(system.torque_invariant_casimirs if dissipation_keeps_casimirs(system) else ())}
     )
 
 

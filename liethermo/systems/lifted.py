@@ -12,6 +12,7 @@ from manifolds._pytree_module import forward_to
 from ..dissipation.base import LiftedDissipation, LiftedGeometry
 from ..functions.energy import Energy
 from .base import System
+from .interface import EngineHints
 
 
 class LiftedSystem(System):
@@ -78,6 +79,10 @@ class LiftedSystem(System):
     def momentum_scale(self, x) -> jax.Array:
         return self.inner.momentum_scale(x[: self.inner.dim])
 
+    @property
+    def hints(self) -> EngineHints:
+        return self.inner.hints._replace(is_smooth=super().hints.is_smooth)
+
     torque_name = forward_to("inner")
     has_impulse = forward_to("inner")
     torque_invariant_casimirs = forward_to("inner")
@@ -86,8 +91,6 @@ class LiftedSystem(System):
     has_angular_velocity = forward_to("inner")
     joint_ranges = forward_to("inner")
     surface = forward_to("inner")
-    can_unroll = forward_to("inner")
-    has_matrix_functions = forward_to("inner")
 
 
 class InnerDissipation(LiftedDissipation):

@@ -21,6 +21,7 @@ from ..functions.energy import Energy
 from ..functions.gradients import EPS
 from ..tracing.interpret import evaluate_at_points
 from .base import System
+from .conservation import dissipation_keeps_casimirs
 from .invariants import resolve_invariants_near, systems_at_test_times
 from .leaf_stability import has_definite_integral, retract
 
@@ -233,7 +234,7 @@ def _regular_kernel(system: System, x: np.ndarray, scale: float) -> np.ndarray |
 
     None if all Casimirs are known, if x lies on a leaf of lower dimension, or if the dissipation leaves the leaf.
     """
-    by_form = system.dissipation_keeps_casimirs
+    by_form = dissipation_keeps_casimirs(system)
     if not by_form or system.torque_name or system.space is not None or system.baths is not None:
         return None
     if system.has_all_casimirs or system.dim > MAX_TENSOR_DIM:

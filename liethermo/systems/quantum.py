@@ -37,9 +37,10 @@ from .conditions import RunCondition
 from .density_states import checked_density_matrices, checked_parts, join_baths, tensor_with_identity
 from .equilibria import Equilibrium, steady_state
 from .hamiltonian import hamiltonian_energy
-from .interface import InvariantVerdicts
+from .interface import EngineHints, InvariantVerdicts
 from .invariants import systems_at_test_times
 from .states import evaluate_batch
+from .transport import has_generator
 
 LINDBLAD_EIGENVALUE_LIMIT = 1e-6
 """Largest modulus of a negative eigenvalue under Lindblad's equation alone, whose steps have errors of their order. The
@@ -386,7 +387,7 @@ class QuantumSystem(System):
         if not grows.size:
             return ""
         eigenvalue = np.linalg.eigvalsh(rho[use[grows[0]]])[0]
-        otherwise = ", or take lt.MetriplecticRungeKutta, whose stages are without it" if self.has_generator else ""
+        otherwise = ", or take lt.MetriplecticRungeKutta, whose stages are without it" if has_generator(self) else ""
         return (
             f"its density matrix has the eigenvalue {eigenvalue:.3g}, which jumps make larger, where the gradient of "
             f"the entropy is infinite: mix it, as in q.state(rho, mixed=1e-6){otherwise}"
@@ -426,7 +427,9 @@ class QuantumSystem(System):
     def _has_dissipation(self, kind: type[Dissipation]) -> bool:
         return self.dissipation is not None and any(isinstance(term, kind) for term in self.dissipation.terms)
 
-    has_matrix_functions = True
+    @property
+    def hints(self) -> EngineHints:
+        return super().hints._replace(has_matrix_functions=True)
 
     # -- heat ---------------------------------------------------------------------------------------------------------
 

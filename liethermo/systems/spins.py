@@ -183,17 +183,14 @@ class SpinSystem(TorqueSystem):
         assert spins is not None
         return dot_vectors(spins.split_covectors(alpha), spins.split_covectors(v))
 
-    @property
-    def can_solve_rotations(self) -> bool:
-        return self._spin_structure is not None
-
-    def solve_rotation(self, angles, v) -> jax.Array:
+    def solve_rotation(self, angles, v) -> jax.Array | None:
         """Return u with ``u_i - angles_i x u_i = v_i`` at each spin, angles of shape (sites, 3), and u = v elsewhere.
 
         ``u = (v + a x v + (a . v) a) / (1 + |a|^2)``, as ``a . u = a . v``.
         """
         spins = self._spin_structure
-        assert spins is not None
+        if spins is None:
+            return None
         a, r = split_vectors(angles), spins.split_covectors(v)
         u = add_vectors(add_vectors(r, cross_vectors(a, r)), scale_vectors(dot_vectors(a, r), a))
         return spins.join_state(scale_vectors(1.0 / (1.0 + dot_vectors(a, a)), u), v[self.body_dim :])

@@ -27,3 +27,15 @@ def is_torque_free(system: SystemInterface) -> bool:
 
     jax.eval_shape(record_answer, jax.ShapeDtypeStruct((system.dim,), jnp.float64))
     return answers[0]
+
+
+def has_generator(system: SystemInterface) -> bool:
+    """Return whether :func:`generator_field` computes the motion without the gradient of the entropy."""
+    return system.dissipation is not None and system.dissipation.has_generator
+
+
+def generator_field(system: SystemInterface, x) -> jax.Array:
+    """Return the vector field at x, shape (n,), in the form that does not contain the entropy."""
+    assert system.dissipation is not None
+    dH = system.energy.gradient(x)
+    return system.poisson.sharp(x, dH) + system.dissipation.generator_field(system, x, dH)

@@ -183,15 +183,15 @@ class DiscreteSystem(Module):
         return _sum_arrays([p.weight * self.system.lagrangian_value(p.q, p.v, p.S) for p in points])
 
     def forces_over_step(self, pair: Pair, friction: bool = True, external: bool = True) -> tuple[jax.Array, jax.Array]:
-        """Return ``F^-_d / h`` and ``F^+_d / h``, shape (n,) each."""
-        impulse_minus = impulse_plus = jnp.zeros_like(pair.V)
+        """Return the forces at the two ends of a step, ``F^-_d / h`` and ``F^+_d / h``, shape (n,) each."""
+        force_at_start = force_at_end = jnp.zeros_like(pair.V)
         for p in self._points_of_maps(self.force_maps, pair):
             F = jnp.zeros_like(p.v)
             F = F + self.system.friction_force(*p[2:]) if friction else F
             F = F + self.system.external_force(*p[2:]) if external else F
             force_minus, force_plus = self._split_force(p.map, pair, p.weight * F)
-            impulse_minus, impulse_plus = impulse_minus + force_minus, impulse_plus + force_plus
-        return impulse_minus, impulse_plus
+            force_at_start, force_at_end = force_at_start + force_minus, force_at_end + force_plus
+        return force_at_start, force_at_end
 
     def momentum_residual(self, p0, pair: Pair) -> jax.Array:
         """Return the residual of ``p_0 = -D_1 L_d - F^-_d``, (3.12) with the momentum of the last step, shape (n,)."""
@@ -217,8 +217,8 @@ class DiscreteSystem(Module):
 
         On a manifold it is the part tangent to the manifold.
         """
-        impulse_minus, impulse_plus = self.forces_over_step(pair)
-        force = jax.grad(self.action)(*pair) + (impulse_minus + impulse_plus)
+        force_at_start, force_at_end = self.forces_over_step(pair)
+        force = jax.grad(self.action)(*pair) + (force_at_start + force_at_end)
         return force if self.curve is None else force - self.momentum_residual(p0, pair) / self.h
 
     def constraint_residual(self, pair: Pair) -> jax.Array:
@@ -232,11 +232,11 @@ class DiscreteSystem(Module):
 
     def work_and_heat_rates(self, pair: Pair) -> tuple[jax.Array, jax.Array]:
         """Return the work and the heat received from outside, per unit of time."""
-        impulse_minus, impulse_plus = self.forces_over_step(pair, friction=False)
+        force_at_start, force_at_end = self.forces_over_step(pair, friction=False)
         heat = _sum_arrays(
             [p.weight * self.system.heating(*p[2:]) for p in self._points_of_maps(self.constraint_maps, pair)]
         )
-        return jnp.dot(impulse_minus + impulse_plus, pair.V), heat
+        return jnp.dot(force_at_start + force_at_end, pair.V), heat
 
     def energy(self, pair: Pair) -> jax.Array:
         """Return ``E = v . L_v - L``, the mean over the points of the discrete Lagrangian."""
@@ -255,8 +255,8 @@ class DiscreteSystem(Module):
 
     def forces(self, q0, q1, S0, S1, friction: bool = True, external: bool = True) -> tuple[jax.Array, jax.Array]:
         """Return the discrete forces ``F^-_d`` and ``F^+_d``, impulses of shape (n,) each [GBY Definition 3.2]."""
-        impulse_minus, impulse_plus = self.forces_over_step(self.pair(q0, q1, S0, S1), friction, external)
-        return self.h * impulse_minus, self.h * impulse_plus
+        force_at_start, force_at_end = self.forces_over_step(self.pair(q0, q1, S0, S1), friction, external)
+        return self.h * force_at_start, self.h * force_at_end
 
     def constraint(self, q0, q1, S0, S1) -> jax.Array:
         """Return ``P_d``, which vanishes for a pair on ``C_K^d`` [GBY 3.8]."""

@@ -392,7 +392,7 @@ def test_an_euler_poincare_system_with_changing_inertia():
     fields = [DrivenSystem(s, unit=1.0) for s in (by_velocity, by_momentum)]
     found = [s.vector_field(s.initial_state(mu, t)) for s in fields]
     assert np.allclose(*found, rtol=1e-12, atol=1e-14)
-    assert not by_velocity.can_unroll
+    assert not by_velocity.hints.can_unroll
 
 
 @pytest.mark.slow

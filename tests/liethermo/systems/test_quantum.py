@@ -12,6 +12,7 @@ import scipy.linalg
 import liethermo as lt
 import manifolds as mf
 from liethermo.functions.gradients import EPS
+from liethermo.systems.transport import generator_field
 
 LOWER = np.array([[0.0, 1.0], [0.0, 0.0]], dtype=complex)
 X = np.array([[0, 1], [1, 0]], dtype=complex)
@@ -133,7 +134,7 @@ def test_the_generator_is_the_force_at_the_gradients(name):
     q = SYSTEMS[name]()
     for x in map(jnp.asarray, q.samples(2, 3)):
         wanted = q.field(x, q.energy.gradient(x), q.entropy.gradient(x))
-        assert np.abs(q.generator_field(x) - wanted).max() <= 1e-12 * np.abs(wanted).max()  # measured: at most 2e-14
+        assert np.abs(generator_field(q, x) - wanted).max() <= 1e-12 * np.abs(wanted).max()  # measured: at most 2e-14
 
 
 def test_the_entropy_has_a_discrete_gradient_in_closed_form():
