@@ -1,9 +1,10 @@
 """Walks the built site in a headless Chromium without a network: ``make docs-check``.
 
 It looks for console errors, files that do not load, links and anchors that lead nowhere, formulas and tables that stay
-raw, pages wider than their screen, tables and outputs that are clipped, and words that the search does not find; and in
-the sources for code in passing that is not true, and for numbers that differ from page to page. Pictures of pages, at
-two widths, light and dark, go to ``docs/_build/screenshots``.
+raw, pages wider than their screen, tables and code that are clipped, and words that the search does not find. In the
+sources it looks for code in passing that is not true, numbers that differ from page to page, paragraphs that begin
+within a line, and code wider than a page. Pictures of pages, at two widths, light and dark, go to
+``docs/_build/screenshots``.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ WORDS = {
 }
 """What a reader looks for, and what a title or an excerpt of the answer holds."""
 
-SHOWN = (
+CLASS_MEMBERS = (
     "index",
     "start/index",
     "tutorials/index",
@@ -86,7 +87,7 @@ PROBE = """(() => {
     images: all("img").map((i) => [
       i.src, i.complete && i.naturalWidth > 0, (i.getAttribute("alt") || "").trim() !== ""]),
     raw: all(".math").filter((e) => !e.querySelector("mjx-container")).map((e) => e.textContent.slice(0, 80)),
-    clipped: all(".bd-article table, .bd-article div.output pre").filter((e) => {
+    clipped: all(".bd-article table, .bd-article div.highlight pre").filter((e) => {
       const box = e.closest(".pst-scrollable-table-container") || e;
       return Math.max(box.scrollWidth - box.clientWidth, e.scrollWidth - e.clientWidth) > 1;
     }).map((e) => e.tagName + ": " + e.textContent.trim().slice(0, 60)),
@@ -94,6 +95,12 @@ PROBE = """(() => {
     wide: document.documentElement.scrollWidth - window.innerWidth,
     culprits: all("body *").filter((e) => e.getBoundingClientRect().right > window.innerWidth + 1 && e.offsetParent
       && !inside(e)).slice(0, 3).map((e) => e.tagName + "." + e.className),
+    cut: all(".bd-article :is(p, dt, li, h1, h2, h3)").filter((e) => {
+      if (!e.offsetParent || e.getBoundingClientRect().right <= document.documentElement.clientWidth + 1) return false;
+      for (let node = e.parentElement; node && node !== document.body; node = node.parentElement)
+        if (["auto", "scroll"].includes(getComputedStyle(node).overflowX)) return false;
+      return true;
+    }).map((e) => e.textContent.trim().slice(0, 60)),
     headerLines: lines,
     previous: !!document.querySelector(".prev-next-footer a, .prev-next-area a"),
   };
@@ -248,11 +255,13 @@ def check_pages(chromium: Browser, html: Path, match: str = "*") -> list[str]:
         wrong += [f"{name}: formula not typeset: {text}" for text in seen["raw"]]
         wrong += [f"{name}: formula in error: {text}" for text in seen["broken"]]
         wrong += [f"{name}: clipped at 1280 pixels: {text}" for text in seen["clipped"]]
-        wrong += [f"{name}: {text}" for text in check_text.raw_tables(page.read_text())]
+        for check in (check_text.raw_tables, check_text.raw_headings):
+            wrong += [f"{name}: {text}" for text in check(page.read_text())]
         if seen["headerLines"] > 1:
             wrong.append(f"{name}: the header takes {seen['headerLines']} lines")
         chromium.resize(390)
         narrow = chromium.evaluate(PROBE)
+        wrong += [f"{name}: cut off at 390 pixels: {text}" for text in narrow["cut"][:3]]
         if narrow["wide"] > 0:
             wrong.append(f"{name}: {narrow['wide']} pixels wider than 390: {narrow['culprits']}")
     for name, link in sorted(set(links)):
@@ -289,11 +298,12 @@ def check_search(chromium: Browser, html: Path) -> list[str]:
 def check_sources(docs: Path) -> list[str]:
     """What the pages say in passing, and the numbers that they share."""
     pages = check_text.sources(docs)
-    return [*check_text.untrue_spans(pages), *check_text.differing_numbers(pages)]
+    checks = (check_text.untrue_spans, check_text.differing_numbers, check_text.lost_paragraphs, check_text.wide_code)
+    return [problem for check in checks for problem in check(pages)]
 
 
 def take_pictures(chromium: Browser, html: Path) -> None:
-    for name, width in itertools.product(SHOWN, WIDTHS):
+    for name, width in itertools.product(CLASS_MEMBERS, WIDTHS):
         chromium.resize(width)
         chromium.open((html / f"{name}.html").as_uri())
         for theme in ("light", "dark"):

@@ -17,6 +17,16 @@ TAG = re.compile(r"<[^>]+>")
 NUMBER = re.compile(r"(?<![\w.^{])\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?(?![\w^])")
 CODE = re.compile(r"```.*?```|\$\$.*?\$\$|\$[^$\n]*\$|<!--.*?-->", re.DOTALL)
 
+FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+LISTING = re.compile(r"^```\w+\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+CODE_ELEMENT = re.compile(r"<(code|pre)\b.*?</\1>", re.DOTALL)
+
+LOST_PARAGRAPH = re.compile(r"(?<=[.:;)`])  +(?=\S)|(?<=\S) ##+ \w")
+"""Two blanks where a paragraph began, or a heading within a line."""
+
+MAX_COLUMNS = 88
+"""Columns of a line of code that a page of the site shows without a scroll bar."""
+
 BEFORE, AFTER = 2, 2
 """Words around a number that make it the same statement on two pages."""
 
@@ -27,6 +37,30 @@ def raw_tables(page: str) -> Iterator[str]:
         text = html.unescape(TAG.sub("", paragraph))
         if RULE.search(text):
             yield f"a table is shown as raw text: {' '.join(text.split())[:80]}"
+
+
+def raw_headings(page: str) -> Iterator[str]:
+    """Yield the paragraphs of a built page that contain the marks of a heading."""
+    for paragraph in PARAGRAPH.findall(CODE_ELEMENT.sub("", page)):
+        text = html.unescape(TAG.sub("", paragraph))
+        if re.search(r"(?:^|\s)##+ \w", text):
+            yield f"a heading is shown as raw text: {' '.join(text.split())[:80]}"
+
+
+def lost_paragraphs(pages: Mapping[str, str]) -> Iterator[str]:
+    """Yield the lines of Markdown pages in which a paragraph or a heading begins within the line."""
+    for name, text in pages.items():
+        for line in FENCE.sub("", text).splitlines():
+            if LOST_PARAGRAPH.search(line) and not line.lstrip().startswith("|"):
+                yield f"{name}: a paragraph begins within a line: {line[:80]}"
+
+
+def wide_code(pages: Mapping[str, str]) -> Iterator[str]:
+    """Yield the lines of code on Markdown pages that are wider than a page of the site."""
+    for name, text in pages.items():
+        for line in "\n".join(LISTING.findall(text)).splitlines():
+            if len(line) > MAX_COLUMNS:
+                yield f"{name}: code has {len(line)} columns, at most {MAX_COLUMNS} are shown: {line[:80]}"
 
 
 def untrue_spans(pages: Mapping[str, str]) -> Iterator[str]:

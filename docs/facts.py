@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import re
 import subprocess
+import textwrap
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import yaml
+from check_text import MAX_COLUMNS
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -39,6 +41,11 @@ def bibtex(citation: dict[str, Any]) -> str:
     return "\n".join(entries)
 
 
+def _wrap(line: str) -> str:
+    """Return the line in parts that a page shows without a scroll bar."""
+    return textwrap.fill(line, MAX_COLUMNS, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
+
+
 def _entry(kind: str, key: str, source: dict[str, Any]) -> str:
     pages = f"{source['start']}--{source['end']}" if "start" in source else None
     preprint = next((i["value"] for i in source.get("identifiers", []) if i["value"].startswith("arXiv:")), None)
@@ -56,7 +63,7 @@ def _entry(kind: str, key: str, source: dict[str, Any]) -> str:
         "eprint": preprint and preprint.removeprefix("arXiv:"),
         "archiveprefix": preprint and "arXiv",
     }
-    lines = [f"  {name} = {{{value}}}," for name, value in fields.items() if value is not None]
+    lines = [_wrap(f"  {name} = {{{value}}},") for name, value in fields.items() if value is not None]
     return "\n".join([f"@{kind}{{{key},", *lines, "}", ""])
 
 

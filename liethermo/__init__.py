@@ -12,7 +12,12 @@ import warnings
 import manifolds  # noqa: F401  (switches 64-bit mode on before anything is traced)
 from manifolds._names import public_dir
 
-from . import bodies, models, testing
+from . import (
+    _class_members,  # noqa: F401  (what help() lists of the classes)
+    bodies,
+    models,
+    testing,
+)
 from .dissipation.adiabatic import AdiabaticJumps
 from .dissipation.base import Dissipation
 from .dissipation.bath_conduction import BathConduction

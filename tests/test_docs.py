@@ -228,39 +228,16 @@ def test_python_in_code_font_that_is_wrong_is_found(code_spans, span, words):
         code_spans.check(span)
 
 
-LOST_PARAGRAPH = re.compile(r"(?<=[.:;)`])  +(?=\S)|(?<=\S) ##+ \w")
-"""Two blanks where a paragraph began, or a heading within a line."""
+def test_no_paragraph_is_lost_in_a_line(check_text):
+    texts = {_name(page): page.read_text() for page in (*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md")}
+    assert sum(len(text.splitlines()) for text in texts.values()) > 4000
+    assert list(check_text.lost_paragraphs(texts)) == []
 
 
-def test_no_paragraph_is_lost_in_a_line():
-    pages = [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md"]
-    lines = [(page, line) for page in pages for line in _words(page).splitlines() if not line.lstrip().startswith("|")]
-    assert len(lines) > 2000
-    assert [f"{_name(page)}: {line}" for page, line in lines if LOST_PARAGRAPH.search(line)] == []
-
-
-@pytest.mark.parametrize("line", ["One ends.  Another begins.", "A text. ## A measurement"])
-def test_a_lost_paragraph_is_found(line):
-    assert LOST_PARAGRAPH.search(line)
-
-
-MAX_COLUMNS = 88
-"""Columns of a line of code that a page of the site shows without a scroll bar."""
-
-
-def test_code_is_not_wider_than_a_page():
-    pages = [page for page in PAGES if page.parent.parent == ROOT / "docs"]
-    assert len(pages) > 50
-    wide = [
-        f"{_name(page)}: {line}"
-        for page in pages
-        for block in re.findall(
-            r"^```(?:python|py|sh|bash|toml|text)\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL
-        )
-        for line in block.splitlines()
-        if len(line) > MAX_COLUMNS
-    ]
-    assert wide == []
+def test_code_is_not_wider_than_a_page(check_text):
+    texts = check_text.sources(ROOT / "docs")
+    assert sum(len(check_text.LISTING.findall(text)) for text in texts.values()) > 200
+    assert list(check_text.wide_code(texts)) == []
 
 
 def test_what_is_no_python_is_left_alone(code_spans):
@@ -376,6 +353,12 @@ def test_a_figure_of_speed_is_found(words, tmp_path):
 def code_links(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "docs" / "_ext"))
     return importlib.import_module("code_links")
+
+
+@pytest.fixture
+def check_text(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    return importlib.import_module("check_text")
 
 
 @pytest.fixture

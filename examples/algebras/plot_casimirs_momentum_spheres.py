@@ -106,3 +106,4 @@ figure, axes = plt.subplots(
 )
 for ax, (g, degree, surface) in zip(axes.flat, surfaces, strict=True):
     draw(ax, g, *g.casimirs(degree), surface)
+plt.show()

@@ -66,3 +66,4 @@ right.axhline(float(entropy(limit)), color="0.5", ls="--", lw=1)
 right.set(xlabel="time", ylabel="entropy")
 for ax in (left, right):
     ax.spines[["top", "right"]].set_visible(False)
+plt.show()

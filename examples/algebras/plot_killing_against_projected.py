@@ -69,3 +69,4 @@ right.set(xlabel="time", title=r"speed of the free motion, $|[\Omega, \mu]|$")
 left.legend(frameon=False)
 for ax in (left, right):
     ax.spines[["top", "right"]].set_visible(False)
+plt.show()

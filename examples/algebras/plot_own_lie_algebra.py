@@ -64,3 +64,4 @@ ax.set(
 )
 ax.legend(frameon=False, ncols=4, loc="lower right")
 ax.spines[["top", "right"]].set_visible(False)
+plt.show()

@@ -90,3 +90,4 @@ for component, (name, color) in zip(momentum.T, axes, strict=True):
 bottom.set(xlabel="time", ylabel="momentum in the body")
 bottom.legend(frameon=False, ncols=3)
 bottom.spines[["top", "right"]].set_visible(False)
+plt.show()

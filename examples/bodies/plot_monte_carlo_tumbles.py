@@ -95,3 +95,4 @@ right.set(
 )
 for axes in (left, right):
     axes.spines[["top", "right"]].set_visible(False)
+plt.show()

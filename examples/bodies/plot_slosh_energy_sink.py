@@ -118,3 +118,4 @@ bottom.plot(
 bottom.set(xlabel="time (s)", ylabel="angle of the fuel (degrees)")
 for axes in (top, bottom):
     axes.spines[["top", "right"]].set_visible(False)
+plt.show()

@@ -99,7 +99,7 @@ axes.set(
     ylabel="angular velocity (deg/s)",
     title="Readings (dots) and the fitted motion (lines)",
 )
-axes.legend(ncol=3, loc="lower right")
+axes.legend(ncol=3, loc="upper right")
 plt.show()
 
 # %%

@@ -71,6 +71,6 @@ for ax, i in zip(axes, (0, -1), strict=False):
     ax.set(xlabel="potential", ylabel="current", title=f"t = {damped.t[i]:g}")
 for run, name in ((ideal, "ideal"), (damped, "with friction")):
     axes[2].plot(run.t, run.energy / run.energy[0], label=name)
-axes[2].set(xlabel="time", ylabel="energy", title="of flow and field")
+axes[2].set(xlabel="time", ylabel="energy / initial energy", title="flow and field")
 axes[2].legend(frameon=False)
 plt.show()

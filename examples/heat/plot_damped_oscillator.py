@@ -47,3 +47,4 @@ right.set(
 )
 for ax in (left, right):
     ax.spines[["top", "right"]].set_visible(False)
+plt.show()

@@ -77,3 +77,4 @@ right.set(xlabel="time (s)", title="ledger (J)")
 right.legend(frameon=False)
 for ax in (left, middle, right):
     ax.spines[["top", "right"]].set_visible(False)
+plt.show()

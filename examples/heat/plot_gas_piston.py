@@ -47,3 +47,4 @@ right.set(xlabel="time (s)", title="temperatures (K)")
 right.legend(frameon=False)
 for ax in (left, middle, right):
     ax.spines[["top", "right"]].set_visible(False)
+plt.show()

@@ -60,3 +60,4 @@ axes[3].plot(
 )
 axes[3].set(xlabel="time", title="growth of the entropy")
 axes[3].spines[["top", "right"]].set_visible(False)
+plt.show()

@@ -57,3 +57,4 @@ right.set(xlabel="density (1 / mm)", title="Where they are")
 right.legend(frameon=False)
 for ax in (left, right):
     ax.spines[["top", "right"]].set_visible(False)
+plt.show()

@@ -110,3 +110,4 @@ draw(1, runs)
 # the others, are a hundred times wider than needed.
 
 draw(2, study(2))
+plt.show()

@@ -45,6 +45,7 @@ for ax, label in zip(
     ax.set(xlabel="time", ylabel=label)
     ax.spines[["top", "right"]].set_visible(False)
 axes[0].legend(frameon=False)
+plt.show()
 
 # %%
 # Without pores the piston rests where the pressures agree, two thirds along the cylinder, as the gases have two and one

@@ -68,3 +68,4 @@ right.set(xlabel="temperature", ylabel="$n_C / (n_A n_B)$")
 right.legend(frameon=False)
 for ax in (left, right):
     ax.spines[["top", "right"]].set_visible(False)
+plt.show()

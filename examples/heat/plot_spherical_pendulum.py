@@ -107,3 +107,4 @@ right.set(xlabel="step (s)", ylabel="error at 4 s", title="against two angles")
 right.legend(frameon=False, fontsize="small")
 for ax in (left, middle, right):
     ax.spines[["top", "right"]].set_visible(False)
+plt.show()

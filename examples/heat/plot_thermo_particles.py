@@ -50,3 +50,4 @@ right.set(xlabel="time", title="Figure 4: temperatures (lines: exact)")
 right.legend(frameon=False)
 for ax in (left, right):
     ax.spines[["top", "right"]].set_visible(False)
+plt.show()

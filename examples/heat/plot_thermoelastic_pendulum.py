@@ -55,3 +55,4 @@ middle.set(xlabel="time", title="lengths of the springs")
 right.set(xlabel="time", title="temperatures")
 for ax in (middle, right):
     ax.spines[["top", "right"]].set_visible(False)
+plt.show()

@@ -67,3 +67,4 @@ right.set(xlabel="time", ylabel="H", title="Figure 6: energy")
 right.legend(frameon=False)
 for ax in (left, right):
     ax.spines[["top", "right"]].set_visible(False)
+plt.show()

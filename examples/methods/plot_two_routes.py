@@ -47,3 +47,4 @@ left.legend(frameon=False, fontsize="small")
 right.set(xlabel="time (s)", ylabel="relative error of the energy, step 0.25 ms")
 for ax in (left, right):
     ax.spines[["top", "right"]].set_visible(False)
+plt.show()

@@ -53,3 +53,4 @@ ax.errorbar(
 ax.set(xlabel="field over temperature", ylabel="magnetisation", title="Spins in a bath")
 ax.legend(frameon=False)
 ax.spines[["top", "right"]].set_visible(False)
+plt.show()

@@ -50,7 +50,7 @@ print(
 
 figure = plt.figure(figsize=(9, 4), layout="constrained")
 ax = figure.add_subplot(1, 2, 1, projection="3d", computed_zorder=False)
-ax.view_init(35, 20)
+ax.view_init(35, -50)
 u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 120), np.linspace(0, np.pi, 60))
 sphere = np.stack([np.sin(v) * np.cos(u), np.sin(v) * np.sin(u), np.cos(v)], axis=-1)
 energies = np.asarray(spin_energy(sphere))
@@ -60,7 +60,7 @@ shade = plt.get_cmap("Blues_r")(
 ax.plot_surface(
     *np.moveaxis(sphere, -1, 0), facecolors=shade, rstride=1, cstride=1, shade=False
 )
-elevation, azimuth = np.radians([35, 20])
+elevation, azimuth = np.radians([35, -50])
 eye = np.array(
     [
         np.cos(elevation) * np.cos(azimuth),
@@ -73,9 +73,16 @@ seen = np.where(
     (spins @ eye > 0)[:, None], spins, np.nan
 )  # not what is behind the sphere
 ax.plot(*seen.T, color="#D55E00", lw=1.0)
-ax.scatter(*spins[-1], color="#D55E00", s=30, depthshade=False)
-ax.set_box_aspect((1, 1, 1), zoom=1.4)
-ax.set(title="The spin; its energy is low where it is dark")
+ax.scatter(*spins[0], facecolor="white", edgecolor="#D55E00", s=30, label="start")
+ax.scatter(*spins[-1], color="#D55E00", s=30, depthshade=False, label="at rest")
+directions = {"easy axis": np.array([0.0, 0.0, 1.0]), "field": np.asarray(field)}
+for name, direction in directions.items():
+    direction = direction / np.linalg.norm(direction)
+    ax.quiver(*direction, *(0.45 * direction), color="k", lw=1.2)
+    ax.text(*(1.55 * direction), name, ha="center")
+ax.legend(frameon=False, loc="lower left")
+ax.set_box_aspect((1, 1, 1), zoom=1.2)
+ax.set(title="Path of the spin; dark: low energy")
 ax.set_axis_off()
 
 right = figure.add_subplot(1, 2, 2)
@@ -86,6 +93,11 @@ for series, name, color in (
     (spin + bath, "sum", "0.3"),
 ):
     right.plot(solution.t, series, color=color, label=name)
-right.set(xlabel="time", ylabel="energy", title="What the spin loses the bath gains")
+right.set(
+    xlabel="time",
+    ylabel="energy",
+    title="The bath gains the energy that the spin loses",
+)
 right.legend(frameon=False, loc="upper right", bbox_to_anchor=(1.0, 0.9))
 right.spines[["top", "right"]].set_visible(False)
+plt.show()

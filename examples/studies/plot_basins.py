@@ -66,3 +66,4 @@ basin = results.status.copy(data=nearest.astype(float))
 basin.attrs = {"long_name": "number of the equilibrium"}
 lt.plot.study(results.assign(basin=basin), "basin")
 plt.gca().set_title("Basins of attraction on the sphere of momenta")
+plt.show()

@@ -138,6 +138,7 @@ for ax, kind in zip(axes, KINDS, strict=True):
     ax.spines[["top", "right"]].set_visible(False)
 axes[0].set(ylabel="error of the energy that is left")
 axes[0].legend(frameon=False, fontsize="x-small")
+plt.show()
 
 # %%
 # The results, relative to the initial mechanical energy and for the stiffest spring:

@@ -70,3 +70,4 @@ plt.plot(inertia, np.sqrt(2.0 * ENERGY / ((inertia - 1.0) ** -2 - 1.0)), "w--")
 # The laws hold in all runs.
 
 print(study.audit())
+plt.show()

@@ -88,7 +88,10 @@ class AdiabaticJumps(ThermalJumps):
 
     >>> sx, sz = np.array([[0.0, 1.0], [1.0, 0.0]]), np.diag([1.0, -1.0])
     >>> angle = lambda t: np.pi / 2 * t / 40.0
-    >>> H = [(sz, lambda t: 0.5 * jnp.cos(angle(t))), (sx, lambda t: 0.5 * jnp.sin(angle(t)))]
+    >>> H = [
+    ...     (sz, lambda t: 0.5 * jnp.cos(angle(t))),
+    ...     (sx, lambda t: 0.5 * jnp.sin(angle(t))),
+    ... ]
     >>> jumps = lt.AdiabaticJumps([(np.array([[0, -1j], [1j, 0]]), 0.2)])
     >>> qubit = lt.QuantumSystem(H, jumps, baths=lt.HeatBaths(np.inf, 0.5))
     >>> run = lt.integrate(qubit, np.eye(2) / 2, (0.0, 40.0), 0.1)

@@ -32,7 +32,10 @@ class BathConduction(HeatConduction):
     --------
     >>> baths = lt.HeatBaths(capacity=[1.0, 20.0], temperature=[2.0, 0.5], number=2)
     >>> spin = lt.SpinSystem(
-    ...     1, lt.magnetism.zeeman(1, (0, 0, 1.0)), [lt.LandauLifshitz(0.1), lt.BathConduction(0.3)], baths
+    ...     1,
+    ...     lt.magnetism.zeeman(1, (0, 0, 1.0)),
+    ...     [lt.LandauLifshitz(0.1), lt.BathConduction(0.3)],
+    ...     baths,
     ... )
     >>> run = lt.integrate(spin, spin.state([[1.0, 0.0, 0.0]]), (0.0, 30.0), 0.1)
     >>> run.audit().passed, spin.temperatures(run.x[-1]).round(2).tolist()

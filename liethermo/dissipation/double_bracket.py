@@ -38,7 +38,9 @@ class DoubleBracket(Damping):
 
     Examples
     --------
-    >>> body = lt.LiePoissonSystem(mf.so(3), lt.Quadratic([1 / 3, 1 / 2, 1.0]), dissipation=lt.DoubleBracket(0.1))
+    >>> body = lt.LiePoissonSystem(
+    ...     mf.so(3), lt.Quadratic([1 / 3, 1 / 2, 1.0]), dissipation=lt.DoubleBracket(0.1)
+    ... )
     >>> run = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 50.0), 0.1)
     >>> size = np.linalg.norm(run.x, axis=1)
     >>> bool(run.energy[-1] < run.energy[0]), bool(np.ptp(size) < 1e-14)

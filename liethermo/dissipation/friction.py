@@ -48,7 +48,9 @@ class Friction(Damping):
     An oscillator with drag loses energy:
 
     >>> J = np.array([[0.0, 1.0], [-1.0, 0.0]])
-    >>> oscillator = lt.MetriplecticSystem(J, lt.Quadratic(np.ones(2)), None, lt.Friction([0.0, 0.2]))
+    >>> oscillator = lt.MetriplecticSystem(
+    ...     J, lt.Quadratic(np.ones(2)), None, lt.Friction([0.0, 0.2])
+    ... )
     >>> run = lt.integrate(oscillator, [1.0, 0.0], (0.0, 20.0), 0.1)
     >>> bool(run.energy[-1] < 0.03 * run.energy[0]), run.audit().passed
     (True, True)

@@ -49,7 +49,9 @@ class LandauLifshitz(Damping):
     --------
     A spin turns towards the field, and its length stays constant:
 
-    >>> system = lt.SpinSystem(1, lt.magnetism.zeeman(1, [0.0, 0.0, 1.0]), lt.LandauLifshitz(0.5))
+    >>> system = lt.SpinSystem(
+    ...     1, lt.magnetism.zeeman(1, [0.0, 0.0, 1.0]), lt.LandauLifshitz(0.5)
+    ... )
     >>> spin = lt.integrate(system, [[0.6, 0.0, 0.8]], (0.0, 20.0), 0.1)
     >>> bool(spin.x[-1, 2] > 0.999), bool(abs(np.linalg.norm(spin.x[-1]) - 1.0) < 1e-14)
     (True, True)

@@ -54,7 +54,9 @@ class ProjectedMetric(Dissipation):
     --------
     >>> g = mf.so(4)
     >>> energy = lt.Quadratic([1.0, 2.0, 3.0, 1.0, 1.5, 2.0])
-    >>> system = lt.LiePoissonSystem(g, energy, g.casimirs(2)[0], lt.ProjectedMetric(rate=0.1))
+    >>> system = lt.LiePoissonSystem(
+    ...     g, energy, g.casimirs(2)[0], lt.ProjectedMetric(rate=0.1)
+    ... )
     >>> bool(system.check().passed)
     True
     """

@@ -92,8 +92,12 @@ class ThermalJumps(Dissipation):
     --------
     >>> lower = np.array([[0, 1], [0, 0]])
     >>> bath = lt.HeatBaths(capacity=np.inf, temperature=0.5)
-    >>> qubit = lt.QuantumSystem(np.diag([0.0, 1.0]), lt.ThermalJumps([(lower, 0.5)]), baths=bath)
-    >>> end = lt.integrate(qubit, qubit.state([[0.2, 0.0], [0.0, 0.8]]), (0.0, 60.0), 0.1).x[-1]
+    >>> qubit = lt.QuantumSystem(
+    ...     np.diag([0.0, 1.0]), lt.ThermalJumps([(lower, 0.5)]), baths=bath
+    ... )
+    >>> end = lt.integrate(
+    ...     qubit, qubit.state([[0.2, 0.0], [0.0, 0.8]]), (0.0, 60.0), 0.1
+    ... ).x[-1]
     >>> populations = np.diag(qubit.density(end)).real
     >>> bool(abs(populations[1] / populations[0] - np.exp(-1.0 / 0.5)) < 1e-6)
     True

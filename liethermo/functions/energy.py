@@ -368,11 +368,11 @@ class TimeDependent(Energy, FunctionWithBreaks):
 
     @property
     def break_times(self) -> tuple[float, ...]:
-        return (*self.breaks, *DeclaredTimes.of_tree(self.function).jumps)
+        return (*self.breaks, *DeclaredTimes.from_tree(self.function).jumps)
 
     @property
     def kink_times(self) -> tuple[float, ...]:
-        return DeclaredTimes.of_tree(self.function).kinks
+        return DeclaredTimes.from_tree(self.function).kinks
 
     def at_time(self, t) -> Energy:
         return Function(FixedTimeFunction(self.function, jnp.asarray(t, dtype=jnp.float64)))

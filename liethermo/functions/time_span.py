@@ -131,7 +131,7 @@ class DeclaredTimes(NamedTuple):
     kinks: tuple[float, ...]
 
     @classmethod
-    def of_tree(cls, tree: Any) -> DeclaredTimes:
+    def from_tree(cls, tree: Any) -> DeclaredTimes:
         """Return the times that the functions of time in a pytree declare."""
         leaves = jax.tree_util.tree_leaves(tree, is_leaf=lambda node: isinstance(node, FunctionWithBreaks))
         functions = [leaf for leaf in leaves if isinstance(leaf, FunctionWithBreaks)]
@@ -139,7 +139,7 @@ class DeclaredTimes(NamedTuple):
         return cls(tuple(sorted(jumps)), tuple(sorted(kinks)))
 
 
-NO_DECLARED_TIMES = DeclaredTimes((), ())
+TIMES_OF_SMOOTH_FUNCTIONS = DeclaredTimes((), ())
 """The declared times of functions that are smooth."""
 
 

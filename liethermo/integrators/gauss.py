@@ -100,7 +100,10 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     --------
     >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
     >>> method = lt.MetriplecticGauss(stages=3)
-    >>> method.order, lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 10.0), 0.5, method).audit().passed
+    >>> (
+    ...     method.order,
+    ...     lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 10.0), 0.5, method).audit().passed,
+    ... )
     (6, True)
     """
 

@@ -47,7 +47,9 @@ class MetriplecticMidpoint(TransportingMethod):
     Examples
     --------
     >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
-    >>> lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 10.0), 0.1, lt.MetriplecticMidpoint()).audit().passed
+    >>> lt.integrate(
+    ...     body, [0.1, 0.2, 1.0], (0.0, 10.0), 0.1, lt.MetriplecticMidpoint()
+    ... ).audit().passed
     True
     """
 

@@ -29,8 +29,12 @@ class Reference:
     Examples
     --------
     >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
-    >>> exact = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 10.0), 1.0, lt.Reference(rtol=1e-12))
-    >>> ours = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 10.0), 0.1, lt.MetriplecticGauss(4))
+    >>> exact = lt.integrate(
+    ...     body, [0.1, 0.2, 1.0], (0.0, 10.0), 1.0, lt.Reference(rtol=1e-12)
+    ... )
+    >>> ours = lt.integrate(
+    ...     body, [0.1, 0.2, 1.0], (0.0, 10.0), 0.1, lt.MetriplecticGauss(4)
+    ... )
     >>> bool(abs(ours.x[-1] - exact.x[-1]).max() < 1e-9)
     True
     """

@@ -13,6 +13,7 @@ import manifolds as mf
 
 from ..errors import InputError
 from ..systems import System
+from ..systems.clock import error_of_step
 from ..tracing.taylor import TaylorSeriesError, check_taylor_series, increment_taylor_coefficients
 from .base import OneStepMethod, register
 from .charts import resolve_retraction
@@ -65,7 +66,9 @@ class MetriplecticTaylor(ExplicitMethod):
     Examples
     --------
     >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
-    >>> run = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 100.0), lt.Adaptive(1e-12), lt.MetriplecticTaylor())
+    >>> run = lt.integrate(
+    ...     body, [0.1, 0.2, 1.0], (0.0, 100.0), lt.Adaptive(1e-12), lt.MetriplecticTaylor()
+    ... )
     >>> run.audit().passed, run.stats.steps < 300
     (True, True)
     """
@@ -163,7 +166,7 @@ class MetriplecticTaylor(ExplicitMethod):
         The first term left out of X' is p + 1 times that of X, so the estimate is right to a factor that tends to 1. It
         also detects a condition (``jnp.where``) whose value has changed inside the step.
         """
-        return h * jnp.max(jnp.abs(system.error_of_step(x, k[StepRow.ERROR], k[StepRow.MEAN_SLOPE])))
+        return h * jnp.max(jnp.abs(error_of_step(system, x, k[StepRow.ERROR], k[StepRow.MEAN_SLOPE])))
 
 
 register(*map(MetriplecticTaylor, (6, 12, 20)))

@@ -238,7 +238,7 @@ def differentiable_stepper(
     InputError
         If functions of time of the system jump: the steps end at the times of the data.
     """
-    if breaks := DeclaredTimes.of_tree(system).jumps:
+    if breaks := DeclaredTimes.from_tree(system).jumps:
         raise InputError(
             f"the system has functions of time that jump, at t = {breaks[0]:g} and other times, where the steps of a "
             "fit do not end. Use functions of time that are continuous"

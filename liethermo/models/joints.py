@@ -57,7 +57,9 @@ class Hinge:
 
     Examples
     --------
-    >>> hinge = lt.bodies.Hinge(at=(0.5, 0.1, 0.0), axis=(0.0, 1.0, 0.0), stiffness=4.0, damping=0.3)
+    >>> hinge = lt.bodies.Hinge(
+    ...     at=(0.5, 0.1, 0.0), axis=(0.0, 1.0, 0.0), stiffness=4.0, damping=0.3
+    ... )
     >>> hinge.size
     1
     """
@@ -131,7 +133,9 @@ class Universal:
 
     Examples
     --------
-    >>> lt.bodies.Universal(at=(0.0, 0.0, 1.0), axes=[(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)], stiffness=2.0).size
+    >>> lt.bodies.Universal(
+    ...     at=(0.0, 0.0, 1.0), axes=[(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)], stiffness=2.0
+    ... ).size
     2
     """
 

@@ -79,7 +79,9 @@ def micromagnet(
     --------
     >>> film = lt.models.micromagnet((8, 4, 1))
     >>> up = np.tile([1.0, 0.0, 0.0], (8, 4, 1, 1))
-    >>> run = lt.integrate(film, film.state(up), (0.0, 1e-11), 2.5e-13, lt.MetriplecticRungeKutta(4))
+    >>> run = lt.integrate(
+    ...     film, film.state(up), (0.0, 1e-11), 2.5e-13, lt.MetriplecticRungeKutta(4)
+    ... )
     >>> bool(run.energy[-1] < run.energy[0])
     True
     """

@@ -281,8 +281,13 @@ def reaction_wheels(
     --------
     >>> motors = lt.torques.Motor([0.01, 0.0, 0.0])
     >>> body = lt.models.reaction_wheels(torque=motors)
-    >>> run = lt.integrate(body, body.state(angular_velocity=(0.0, 0.0, 0.0)), (0.0, 10.0), 0.1)
-    >>> bool(lt.bodies.angular_velocity(run)[-1, 0] < 0.0), float(abs(run.x[-1, :3]).max()) < 1e-15
+    >>> run = lt.integrate(
+    ...     body, body.state(angular_velocity=(0.0, 0.0, 0.0)), (0.0, 10.0), 0.1
+    ... )
+    >>> (
+    ...     bool(lt.bodies.angular_velocity(run)[-1, 0] < 0.0),
+    ...     float(abs(run.x[-1, :3]).max()) < 1e-15,
+    ... )
     (True, True)
     """
     directions = jnp.atleast_2d(checked_numbers(axes, "axes"))

@@ -418,9 +418,17 @@ class PiecewiseConstant(Module):
 
     Examples
     --------
-    >>> pulses = lt.torques.PiecewiseConstant([2.0, 2.5, 7.0], [(0.0, 0.0, 0.1), (0.2, 0.0, 0.0)])
+    >>> pulses = lt.torques.PiecewiseConstant(
+    ...     [2.0, 2.5, 7.0], [(0.0, 0.0, 0.1), (0.2, 0.0, 0.0)]
+    ... )
     >>> body = lt.LiePoissonSystem(mf.so(3), lt.Quadratic([1.0, 0.5, 0.4]), torque=pulses)
-    >>> solution = lt.integrate(body, [0.1, 0.0, 1.0], (0.0, 10.0), lt.Adaptive(1e-9), lt.MetriplecticRungeKutta(8))
+    >>> solution = lt.integrate(
+    ...     body,
+    ...     [0.1, 0.0, 1.0],
+    ...     (0.0, 10.0),
+    ...     lt.Adaptive(1e-9),
+    ...     lt.MetriplecticRungeKutta(8),
+    ... )
     >>> bool(np.isin([2.0, 2.5, 7.0], solution.t).all())
     True
     """

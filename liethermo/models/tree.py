@@ -64,8 +64,17 @@ class Tree:
 
     >>> tree = lt.bodies.Tree()
     >>> bus = tree.add("bus", mass=10.0, inertia=(3.0, 2.0, 1.5))
-    >>> hinge = lt.bodies.Hinge(at=(0.5, 0.1, 0.0), axis=(0.0, 1.0, 0.0), stiffness=4.0, damping=0.3)
-    >>> panel = tree.add("panel", mass=2.0, centre=(0.8, 0.0, 0.1), inertia=(0.05, 0.4, 0.42), parent=bus, joint=hinge)
+    >>> hinge = lt.bodies.Hinge(
+    ...     at=(0.5, 0.1, 0.0), axis=(0.0, 1.0, 0.0), stiffness=4.0, damping=0.3
+    ... )
+    >>> panel = tree.add(
+    ...     "panel",
+    ...     mass=2.0,
+    ...     centre=(0.8, 0.0, 0.1),
+    ...     inertia=(0.05, 0.4, 0.42),
+    ...     parent=bus,
+    ...     joint=hinge,
+    ... )
     >>> system = tree.system(baths=lt.HeatBaths(capacity=50.0, temperature=300.0))
     >>> x0 = system.state(angular_velocity=(0.3, 0.1, 0.8), joints={"panel": 0.4})
     >>> solution = lt.integrate(system, x0, (0.0, 10.0), 0.05, lt.MetriplecticGauss(2))
@@ -76,9 +85,17 @@ class Tree:
 
     >>> tree = lt.bodies.Tree(ground="ceiling")
     >>> hinge = lt.bodies.Hinge(at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
-    >>> bob = tree.add("bob", mass=1.0, centre=(0.0, 0.0, -0.5), parent="ceiling", joint=hinge)
+    >>> bob = tree.add(
+    ...     "bob", mass=1.0, centre=(0.0, 0.0, -0.5), parent="ceiling", joint=hinge
+    ... )
     >>> pendulum = tree.system(gravity=(0.0, 0.0, -9.81))
-    >>> swing = lt.integrate(pendulum, pendulum.state(joints={"bob": 0.3}), (0.0, 5.0), 0.05, lt.MetriplecticGauss(2))
+    >>> swing = lt.integrate(
+    ...     pendulum,
+    ...     pendulum.state(joints={"bob": 0.3}),
+    ...     (0.0, 5.0),
+    ...     0.05,
+    ...     lt.MetriplecticGauss(2),
+    ... )
     >>> swing.audit().passed
     True
     """

@@ -174,9 +174,17 @@ def joint_rates(solution: AuditableResult) -> dict[str, np.ndarray]:
     --------
     >>> tree = lt.bodies.Tree()
     >>> bus = tree.add("bus", mass=4.0, inertia=(2.0, 2.0, 3.0))
-    >>> wheel = tree.add("wheel", 1.0, inertia=(0.4, 0.4, 0.5), parent=bus, joint=lt.bodies.Hinge((0, 0, 0), (0, 0, 1)))
+    >>> wheel = tree.add(
+    ...     "wheel",
+    ...     1.0,
+    ...     inertia=(0.4, 0.4, 0.5),
+    ...     parent=bus,
+    ...     joint=lt.bodies.Hinge((0, 0, 0), (0, 0, 1)),
+    ... )
     >>> system = tree.system()
-    >>> solution = lt.integrate(system, system.state(joint_rates={"wheel": 0.2}), (0.0, 1.0), 0.5)
+    >>> solution = lt.integrate(
+    ...     system, system.state(joint_rates={"wheel": 0.2}), (0.0, 1.0), 0.5
+    ... )
     >>> lt.bodies.joint_rates(solution)["wheel"].round(12).tolist()
     [0.2, 0.2, 0.2]
     """

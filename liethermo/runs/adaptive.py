@@ -42,7 +42,13 @@ class Adaptive:
     Examples
     --------
     >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
-    >>> run = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 1e3), lt.Adaptive(rtol=1e-8), lt.MetriplecticRungeKutta(8))
+    >>> run = lt.integrate(
+    ...     body,
+    ...     [0.1, 0.2, 1.0],
+    ...     (0.0, 1e3),
+    ...     lt.Adaptive(rtol=1e-8),
+    ...     lt.MetriplecticRungeKutta(8),
+    ... )
     >>> float(run.t[-1]), run.stats.steps < 1000
     (1000.0, True)
     """

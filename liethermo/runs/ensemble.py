@@ -127,7 +127,9 @@ def ensemble(
     Examples
     --------
     >>> starts = np.random.default_rng(0).standard_normal((100, 3))
-    >>> many = lt.ensemble(lt.models.rigid_body(rate=0.2), starts, (0.0, 5.0), 0.05, outputs="summary")
+    >>> many = lt.ensemble(
+    ...     lt.models.rigid_body(rate=0.2), starts, (0.0, 5.0), 0.05, outputs="summary"
+    ... )
     >>> many.energy.shape, bool(many.ok.all())
     ((100,), True)
     """
@@ -149,7 +151,7 @@ def ensemble(
         )
     family = Family.from_arguments(system, parameters)
     save_every_step = save_every if outputs == "trajectory" and save_at is None else None
-    declared = DeclaredTimes.of_tree(family.with_unknown_parameters())
+    declared = DeclaredTimes.from_tree(family.with_unknown_parameters())
     schedule = make_schedule(t_span, step, save_every_step, save_at, breaks=breaks, declared=declared)
     attitude = attitude_array(attitude, None)
     states, reasons = _checked_initial_states(family, x0s, len(attitude) if np.ndim(attitude) == 3 else 1)

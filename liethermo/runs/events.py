@@ -41,7 +41,9 @@ class Relaxed:
     Examples
     --------
     >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
-    >>> run = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 1e4), lt.Adaptive(1e-8), until=lt.Relaxed(1e-6))
+    >>> run = lt.integrate(
+    ...     body, [0.1, 0.2, 1.0], (0.0, 1e4), lt.Adaptive(1e-8), until=lt.Relaxed(1e-6)
+    ... )
     >>> run.status.code
     'event'
     """

@@ -128,7 +128,12 @@ def integrate(
     Adaptive steps of order 8, until the body has come to rest:
 
     >>> solution = lt.integrate(
-    ...     body, [0.1, 0.2, 1.0], (0.0, 1e4), lt.Adaptive(1e-9), lt.MetriplecticRungeKutta(8), until=lt.Relaxed(1e-8)
+    ...     body,
+    ...     [0.1, 0.2, 1.0],
+    ...     (0.0, 1e4),
+    ...     lt.Adaptive(1e-9),
+    ...     lt.MetriplecticRungeKutta(8),
+    ...     until=lt.Relaxed(1e-8),
     ... )
     >>> solution.status.code, solution.event_time < 1e3
     ('event', True)

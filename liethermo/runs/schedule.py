@@ -13,7 +13,7 @@ import numpy as np
 from ..engines.array_engine import MAX_SAVES_PER_CALL
 from ..errors import InputError
 from ..functions.gradients import EPS
-from ..functions.time_span import NO_DECLARED_TIMES, DeclaredTimes, checked_breaks
+from ..functions.time_span import TIMES_OF_SMOOTH_FUNCTIONS, DeclaredTimes, checked_breaks
 from .adaptive import Adaptive
 
 CHUNK_STEPS = 100_000
@@ -278,7 +278,7 @@ def make_schedule(
     save_at=None,
     allow_infinite_end: bool = False,
     breaks: Sequence[float] = (),
-    declared: DeclaredTimes = NO_DECLARED_TIMES,
+    declared: DeclaredTimes = TIMES_OF_SMOOTH_FUNCTIONS,
 ) -> StepSchedule:
     """Return the schedule of a run; an adaptive run has one nominal step, as long as the span.
 

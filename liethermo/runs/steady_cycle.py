@@ -144,11 +144,17 @@ def steady_cycle(
 
     >>> lower, excited = np.array([[0, 1], [0, 0]]), np.diag([0.0, 1.0])
     >>> wave = lambda t: jnp.sin(2 * np.pi * t / 40.0)
-    >>> hot = lt.ThermalJumps([(lower, lambda w, T, t: 0.5 * jnp.maximum(wave(t) - 0.8, 0.0))], bath=0)
-    >>> cold = lt.ThermalJumps([(lower, lambda w, T, t: 0.5 * jnp.maximum(-wave(t) - 0.8, 0.0))], bath=1)
+    >>> hot = lt.ThermalJumps(
+    ...     [(lower, lambda w, T, t: 0.5 * jnp.maximum(wave(t) - 0.8, 0.0))], bath=0
+    ... )
+    >>> cold = lt.ThermalJumps(
+    ...     [(lower, lambda w, T, t: 0.5 * jnp.maximum(-wave(t) - 0.8, 0.0))], bath=1
+    ... )
     >>> H = [(excited, lambda t: 1.5 + 0.5 * jnp.clip(2.0 * wave(t), -1.0, 1.0))]
     >>> engine = lt.QuantumSystem(H, [hot, cold], baths=lt.HeatBaths(np.inf, [1.6, 0.4], 2))
-    >>> cycle = lt.steady_cycle(engine, 40.0, 0.5, breaks=40.0 / 12.0 * np.array([1, 5, 7, 11]))  # kinks of H
+    >>> cycle = lt.steady_cycle(
+    ...     engine, 40.0, 0.5, breaks=40.0 / 12.0 * np.array([1, 5, 7, 11])
+    ... )  # kinks of H
     >>> cycle.work < 0.0, round(cycle.efficiency, 12), 1 - 1.0 / 2.0
     (True, 0.5, 0.5)
     """

@@ -60,7 +60,10 @@ class HeatBaths(Module):
     Examples
     --------
     >>> body = lt.LiePoissonSystem(
-    ...     mf.so(3), lt.Quadratic([1 / 3, 1 / 2, 1.0]), dissipation=lt.DoubleBracket(0.1), baths=lt.HeatBaths(2.0)
+    ...     mf.so(3),
+    ...     lt.Quadratic([1 / 3, 1 / 2, 1.0]),
+    ...     dissipation=lt.DoubleBracket(0.1),
+    ...     baths=lt.HeatBaths(2.0),
     ... )
     >>> run = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 50.0), 0.1)
     >>> bool(run.entropy[-1] > run.entropy[0]), run.audit().energy_drift < 1e-13

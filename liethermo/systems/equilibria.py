@@ -247,7 +247,10 @@ def steady_state(system: System, x0=None, t: float | None = None) -> Equilibrium
 
     >>> lower = np.array([[0, 1], [0, 0]])
     >>> baths = lt.HeatBaths(capacity=np.inf, temperature=[0.5, 2.0], number=2)
-    >>> jumps = [lt.ThermalJumps([(lower, 0.1)], bath=0), lt.ThermalJumps([(lower, 0.1)], bath=1)]
+    >>> jumps = [
+    ...     lt.ThermalJumps([(lower, 0.1)], bath=0),
+    ...     lt.ThermalJumps([(lower, 0.1)], bath=1),
+    ... ]
     >>> qubit = lt.QuantumSystem(np.diag([0.0, 1.0]), jumps, baths=baths)
     >>> rest = lt.steady_state(qubit)
     >>> rest.stable, bool(rest.bath_heat[0] > 0.0), bool(abs(rest.bath_heat.sum()) < 1e-14)

@@ -364,7 +364,10 @@ def linearise(system: System, x, t: float | None = None) -> Linearisation:
     A free rigid body is unstable about its middle axis:
 
     >>> body = lt.models.free_rigid_body((3.0, 2.0, 1.0))
-    >>> lt.linearise(body, [0.0, 1.0, 0.0]).stable, lt.linearise(body, [0.0, 0.0, 1.0]).stable
+    >>> (
+    ...     lt.linearise(body, [0.0, 1.0, 0.0]).stable,
+    ...     lt.linearise(body, [0.0, 0.0, 1.0]).stable,
+    ... )
     (False, True)
     """
     system = frozen_system(system, t)

@@ -84,7 +84,12 @@ def attitude(
     >>> g = lt.bodies.attitude(euler=(90.0, 0.0, 0.0), sequence="zyx", degrees=True)
     >>> np.allclose(g @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
     True
-    >>> np.allclose(lt.bodies.attitude(quaternion=(np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)), scalar="first"), g)
+    >>> np.allclose(
+    ...     lt.bodies.attitude(
+    ...         quaternion=(np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)), scalar="first"
+    ...     ),
+    ...     g,
+    ... )
     True
     """
     arguments = {"quaternion": quaternion, "euler": euler, "matrix": matrix, "rotation": rotation}

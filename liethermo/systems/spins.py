@@ -73,7 +73,9 @@ class SpinSystem(TorqueSystem):
     --------
     A spin in a field along the third axis, damped towards it:
 
-    >>> system = lt.SpinSystem(1, lt.magnetism.zeeman(1, [0.0, 0.0, 1.0]), lt.LandauLifshitz(0.5))
+    >>> system = lt.SpinSystem(
+    ...     1, lt.magnetism.zeeman(1, [0.0, 0.0, 1.0]), lt.LandauLifshitz(0.5)
+    ... )
     >>> spin = lt.integrate(system, [[1.0, 0.0, 0.0]], (0.0, 20.0), 0.1)
     >>> bool(spin.x[-1, 2] > 0.999), spin.audit().passed
     (True, True)

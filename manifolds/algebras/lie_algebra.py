@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arrays import is_traced, real_components, square_matrices
+from .._arrays import is_traced, real_array, real_components, square_matrices
 from .._names import checked_names
 from ..errors import LieAlgebraError, ParameterError
 from ._basis_scaling import STRUCTURE_TOLERANCE, balance_constants
@@ -67,7 +67,10 @@ class LieAlgebra(StructureMethods):
     Examples
     --------
     >>> C = np.zeros((3, 3, 3))
-    >>> C[0, 1, 2], C[0, 2, 1] = 1, -1  # [e1, e2] = e3, [e1, e3] = -e2: the motions of the plane
+    >>> C[0, 1, 2], C[0, 2, 1] = (
+    ...     1,
+    ...     -1,
+    ... )  # [e1, e2] = e3, [e1, e3] = -e2: the motions of the plane
     >>> g = mf.LieAlgebra.from_structure_constants(C - C.swapaxes(0, 1), name="plane")
     >>> print(*g.casimirs(degree=2))
     mu2**2 + mu3**2
@@ -172,7 +175,9 @@ class LieAlgebra(StructureMethods):
 
         Examples
         --------
-        >>> g = mf.LieAlgebra.from_brackets({("e2", "e4"): "e1", ("e3", "e4"): {"e2": 1}}, name="A4,1")
+        >>> g = mf.LieAlgebra.from_brackets(
+        ...     {("e2", "e4"): "e1", ("e3", "e4"): {"e2": 1}}, name="A4,1"
+        ... )
         >>> print(*g.casimirs(max_degree=2), sep=", ")
         e1, 2*e1*e3 - e2**2
         """
@@ -268,11 +273,13 @@ class LieAlgebra(StructureMethods):
 
     def bracket(self, x, y) -> jax.Array:
         """Return the Lie bracket ``[x, y]``; ``x``, ``y`` and the result have shape (..., dim)."""
-        return jnp.einsum("abc,...a,...b->...c", self.structure_constants, self._element(x, "x"), self._element(y, "y"))
+        return jnp.einsum(
+            "abc,...a,...b->...c", real_array(self.structure_constants), self._element(x, "x"), self._element(y, "y")
+        )
 
     def ad(self, x) -> jax.Array:
         """Return the matrix of ``y -> [x, y]``, shape (..., dim, dim): ``ad(x) @ y == bracket(x, y)``."""
-        return jnp.einsum("abc,...a->...cb", self.structure_constants, self._element(x, "x"))
+        return jnp.einsum("abc,...a->...cb", real_array(self.structure_constants), self._element(x, "x"))
 
     def ad_star(self, x, mu) -> jax.Array:
         """Return the coadjoint operator ``ad*_x mu``, defined by ``<ad*_x mu, y> = <mu, [x, y]>`` [BFM, after 3.1].
@@ -294,7 +301,7 @@ class LieAlgebra(StructureMethods):
             If the last axes differ from ``dim``.
         """
         return jnp.einsum(
-            "abc,...a,...c->...b", self.structure_constants, self._element(x, "x"), self._element(mu, "mu")
+            "abc,...a,...c->...b", real_array(self.structure_constants), self._element(x, "x"), self._element(mu, "mu")
         )
 
     def poisson_tensor(self, mu) -> jax.Array:

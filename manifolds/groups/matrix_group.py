@@ -138,7 +138,9 @@ class MatrixGroup:
         Examples
         --------
         >>> boost = jnp.diag(jnp.array([1.0, 1.0, -1.0]))
-        >>> lorentz = mf.MatrixGroup.from_equations(lambda A: A.T @ boost @ A - boost, 3, name="O(2,1)")
+        >>> lorentz = mf.MatrixGroup.from_equations(
+        ...     lambda A: A.T @ boost @ A - boost, 3, name="O(2,1)"
+        ... )
         >>> print(lorentz.dim, lorentz.algebra.isomorphism_type())
         3 A3,8
         """

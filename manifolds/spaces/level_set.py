@@ -59,7 +59,9 @@ class LevelSet(Space):
 
     Examples
     --------
-    >>> ellipsoid = mf.LevelSet(lambda x: x[0] ** 2 + x[1] ** 2 / 4 + x[2] ** 2 / 9 - 1, (3,))
+    >>> ellipsoid = mf.LevelSet(
+    ...     lambda x: x[0] ** 2 + x[1] ** 2 / 4 + x[2] ** 2 / 9 - 1, (3,)
+    ... )
     >>> x = ellipsoid.point([1.0, 1.0, 1.0], project=True)
     >>> ellipsoid.dim, bool(ellipsoid.belongs(x))
     (2, True)

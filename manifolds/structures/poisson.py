@@ -198,7 +198,10 @@ class PoissonTensor(PoissonStructure):
     Examples
     --------
     >>> rotations = mf.PoissonTensor(lambda x: jnp.cross(jnp.eye(3), x), 3)
-    >>> print(rotations.rank(np.array([0.0, 0.0, 1.0])), bool(rotations.jacobi_residual(np.ones(3)) < 1e-14))
+    >>> print(
+    ...     rotations.rank(np.array([0.0, 0.0, 1.0])),
+    ...     bool(rotations.jacobi_residual(np.ones(3)) < 1e-14),
+    ... )
     2 True
     """
 

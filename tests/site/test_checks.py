@@ -22,6 +22,40 @@ def test_a_table_that_stays_raw_is_found(check_text):
     assert problem.startswith("a table is shown as raw text: | a |")
 
 
+def test_a_heading_that_stays_raw_is_found(check_text):
+    good_page = "<h2>A measurement</h2><p>Issue #12, C# and <code>## code</code>.</p><pre>## A comment</pre>"
+    assert list(check_text.raw_headings(good_page)) == []
+    (problem,) = check_text.raw_headings(good_page + "<p>A text. ## A measurement</p>")
+    assert problem.startswith("a heading is shown as raw text: A text.")
+
+
+@pytest.mark.parametrize("line", ["One ends.  Another begins.", "A `name`.  Another.", "A text. ## A measurement"])
+def test_a_paragraph_that_begins_within_a_line_is_found(check_text, line):
+    good_page = "## A heading\n\nA text. Another.\n\n```text\na.  b\n```\n\n| a.  | b |\n"
+    assert list(check_text.lost_paragraphs({"page.md": good_page})) == []
+    (problem,) = check_text.lost_paragraphs({"page.md": f"{good_page}\n{line}\n"})
+    assert line in problem
+
+
+@pytest.mark.parametrize("language", ["python", "sh", "bibtex"])
+def test_code_wider_than_a_page_is_found(check_text, language):
+    page = f"{100 * 'w'}\n\n```{language}\n{{}}\n```\n"
+    assert list(check_text.wide_code({"page.md": page.format(check_text.MAX_COLUMNS * "x")})) == []
+    (problem,) = check_text.wide_code({"page.md": page.format((check_text.MAX_COLUMNS + 1) * "x")})
+    assert "89 columns" in problem
+
+
+def test_the_check_of_the_sources_finds_each_kind(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(str(DOCS))
+    check_site = importlib.import_module("check_site")
+    page = tmp_path / "page.md"
+    page.write_text("A text.\n")
+    assert check_site.check_sources(tmp_path) == []
+    page.write_text(f"One ends.  Another begins.\n\n```python\n{100 * 'x'}\n```\n\n`lt.Adaptive(colour=3)`\n")
+    kinds = ("colour", "begins within a line", "100 columns")
+    assert [sum(kind in problem for problem in check_site.check_sources(tmp_path)) for kind in kinds] == [1, 1, 1]
+
+
 def test_a_code_span_that_is_not_true_is_found(check_text):
     good_page = "`lt.Adaptive(1e-8)` and `make docs`."
     assert list(check_text.untrue_spans({"page.md": good_page})) == []
@@ -51,12 +85,28 @@ def test_the_pages_share_their_numbers(check_text):
 def test_what_is_clipped_is_found(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(str(DOCS))
     check_site = importlib.import_module("check_site")
-    cell = "<td>" + "w" * 40 + "</td>"
-    page = "<div class='bd-article'><table style='display: block; overflow: auto; width: 900px'><tr>{}</tr></table>"
-    (tmp_path / "right.html").write_text(page.format(cell))
-    (tmp_path / "wrong.html").write_text(page.format(12 * cell))
+    cell, style = "<td>" + "w" * 40 + "</td>", "style='display: block; overflow: auto; width: 900px'"
+    page = f"<div class='bd-article'><table {style}><tr>{{}}</tr></table>"
+    page += f"<div class='highlight'><pre {style}>{{}}</pre></div></div>"
+    (tmp_path / "right.html").write_text(page.format(cell, 88 * "x"))
+    (tmp_path / "table.html").write_text(page.format(12 * cell, 88 * "x"))
+    (tmp_path / "code.html").write_text(page.format(cell, 188 * "x"))
     with check_site.browser() as chromium:
         problems = check_site.check_pages(chromium, tmp_path)
     clipping_problems = [line for line in problems if "clipped" in line]
-    assert len(clipping_problems) == 1
-    assert clipping_problems[0].startswith("wrong.html: ")
+    assert [line.split(".html: ")[0] for line in clipping_problems] == ["code", "table"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("chromium"), reason="no Chromium on this machine")
+def test_text_that_a_narrow_screen_cuts_off_is_found(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(str(DOCS))
+    check_site = importlib.import_module("check_site")
+    page = "<meta name='viewport' content='width=device-width'><div style='overflow-x: {}'><div class='bd-article'>"
+    page += "<p style='width: {}px'>A sentence.</p></div></div>"
+    (tmp_path / "right.html").write_text(page.format("hidden", 300))
+    (tmp_path / "scrolled.html").write_text(page.format("auto", 500))
+    (tmp_path / "wrong.html").write_text(page.format("hidden", 500))
+    with check_site.browser() as chromium:
+        problems = check_site.check_pages(chromium, tmp_path)
+    assert problems == ["wrong.html: cut off at 390 pixels: A sentence."]

@@ -107,10 +107,12 @@ def test_the_citation_has_what_the_file_has(monkeypatch):
     facts = importlib.import_module("facts")
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     bibtex = facts.bibtex(citation)
+    one_line_each = " ".join(bibtex.split())
     assert f"version = {{{citation['version']}}}" in bibtex
+    assert max(map(len, bibtex.splitlines())) <= facts.MAX_COLUMNS
     assert re.search(r"year = \{20\d\d\}", bibtex)
     for paper in citation["references"]:
-        assert f"title = {{{{{paper['title']}}}}}" in bibtex
+        assert f"title = {{{{{paper['title']}}}}}" in one_line_each
         assert paper.get("doi", "") in bibtex
     assert bibtex.count("{") == bibtex.count("}")
     assert len(re.findall(r"^@\w+\{", bibtex, re.MULTILINE)) == 1 + len(citation["references"])

@@ -62,7 +62,9 @@ def spin_wave_frequencies(
     >>> chain = lt.magnetism.lattice("chain", 8)
     >>> up = np.tile([0.0, 0.0, 1.0], (8, 1))
     >>> q = [(0.5 * np.pi, 0.0, 0.0)]
-    >>> lt.magnetism.spin_wave_frequencies(lt.magnetism.exchange(chain, 1.0), chain, up, q).round(6).tolist()
+    >>> lt.magnetism.spin_wave_frequencies(
+    ...     lt.magnetism.exchange(chain, 1.0), chain, up, q
+    ... ).round(6).tolist()
     [[2.0]]
     """
     function = make_energy(energy, "the energy")

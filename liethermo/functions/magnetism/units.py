@@ -160,7 +160,10 @@ def units(name: str = "meV") -> Units:
     >>> meV = lt.magnetism.units("meV")
     >>> motion = meV.gilbert(0.1, moment=meV.moment(2.2))
     >>> iron = lt.SpinSystem(
-    ...     1, lt.magnetism.zeeman(1, (0, 0, 1.0), meV.moment(2.2)), lt.LandauLifshitz(motion.rate), ratio=motion.ratio
+    ...     1,
+    ...     lt.magnetism.zeeman(1, (0, 0, 1.0), meV.moment(2.2)),
+    ...     lt.LandauLifshitz(motion.rate),
+    ...     ratio=motion.ratio,
     ... )
     """
     k, hbar = scipy.constants.Boltzmann, scipy.constants.hbar

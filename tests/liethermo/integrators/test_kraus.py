@@ -79,6 +79,26 @@ def test_a_method_that_is_no_channel_leaves_the_cone():
     assert row.passed is None
 
 
+@pytest.mark.parametrize("outputs", ["final", "trajectory"])
+def test_the_audit_of_an_ensemble_shows_the_least_eigenvalue(outputs, tmp_path):
+    """The worst trajectory is the one that starts in the upper level; a quantum channel keeps the others positive."""
+    system = lt.QuantumSystem(H, lt.LindbladJumps([(LOWER, 4.0)]))
+    states = np.stack([np.eye(2) / 2, UPPER_LEVEL])
+    rows = {}
+    for method in (lt.KrausMethod(2), lt.MetriplecticGauss(1)):
+        many = lt.ensemble(system, states, (0.0, 8.0), 2.0, method, outputs=outputs, parameters=None)
+        rows[type(method)] = next(row for row in many.audit().rows if row.law == "least eigenvalue of rho")
+        many.save(tmp_path / "many.nc")
+        assert str(lt.load(tmp_path / "many.nc").audit()) == str(many.audit())
+    assert rows[lt.KrausMethod].passed
+    assert rows[lt.KrausMethod].value > -1e-14
+    gauss = rows[lt.MetriplecticGauss]
+    assert gauss.passed is None
+    if outputs == "trajectory":
+        expected = min(np.linalg.eigvalsh(system.density(many.x))[np.isfinite(many.energy)].min(), 0.0)
+        assert gauss.value == pytest.approx(expected, abs=1e-12)
+
+
 def test_a_fast_precession_needs_no_short_steps():
     """Coherence turns 1,600 times between two steps; W is exact."""
     omega, gamma = 1e4, 0.1

@@ -329,10 +329,10 @@ def test_steps_end_at_the_times_of_a_linear_table(reference_with_table, method, 
 def test_a_step_across_a_kink_would_lose_the_order(reference_with_table):
     """The control: the same values as a function that declares nothing."""
 
-    def undeclared(t, m):
+    def torque(t, m):
         return jnp.stack([jnp.interp(t, KNOTS, column) for column in MOMENTS.T])
 
-    body = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1.0 / INERTIA), torque=undeclared)
+    body = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1.0 / INERTIA), torque=torque)
     run = lt.integrate(body, X0, (0.0, END), lt.Adaptive(1e-9), lt.MetriplecticRungeKutta(8))
     assert np.abs(run.x[-1] - reference_with_table).max() > 1e-8
 

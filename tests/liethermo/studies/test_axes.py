@@ -5,8 +5,7 @@ import pytest
 from scipy.stats import qmc
 
 import liethermo as lt
-from liethermo.studies.axes import Axes
-from liethermo.studies.store import axes_in_store_order
+from liethermo.studies.axes import Axes, axes_in_store_order
 from tests.refusals import refusal_test
 
 
