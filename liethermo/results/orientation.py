@@ -219,6 +219,14 @@ def nutation(solution: AuditableResult, axis=None) -> np.ndarray:
     ------
     InputError
         If an axis is needed, or there is no momentum.
+
+    Examples
+    --------
+    >>> body = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.5)
+    >>> run = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 100.0), 0.1)
+    >>> angle = lt.bodies.nutation(run, axis=[1.0, 0.0, 0.0])
+    >>> bool(angle[0] > 1.0), bool(min(angle[-1], 3.1416 - angle[-1]) < 0.1)
+    (True, True)
     """
     mu, (a, b, e) = _momenta(solution), _body_frame(solution, axis)
     return np.arctan2(np.hypot(mu @ a, mu @ b), mu @ e)

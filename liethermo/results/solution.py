@@ -176,6 +176,13 @@ class Solution(AuditableResult):
         ------
         InputError
             If the name of a tolerance is unknown, or a tolerance is negative.
+
+        Examples
+        --------
+        >>> body = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.1)
+        >>> audit = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 10.0), 0.1).audit()
+        >>> audit.passed, bool(audit.energy_drift < 1e-13)
+        (True, True)
         """
         return audit_run(self, Tolerances.with_defaults(**tolerances))
 
