@@ -168,7 +168,7 @@ def joint_rates(solution: AuditableResult) -> dict[str, np.ndarray]:
     Raises
     ------
     InputError
-        If the system is no tree of jointed bodies, or no states were kept.
+        If the system is not a tree of jointed bodies, or no states were kept.
 
     Examples
     --------
@@ -191,7 +191,7 @@ def joint_rates(solution: AuditableResult) -> dict[str, np.ndarray]:
     if solution.x is None:
         raise InputError('no states were kept: run the ensemble with outputs="final" or "trajectory"')
     if "joint_rates" not in solution.velocity_sources:
-        raise InputError("the result has no joint rates: its system is no tree of jointed bodies")
+        raise InputError("the result has no joint rates: its system is not a tree of jointed bodies")
     rates = solution.velocity_sources["joint_rates"]()
     first = min(start for start, _ in solution.provenance["joints"].values())
     return solution.split_by_joint(rates, first)

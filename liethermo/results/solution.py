@@ -193,7 +193,7 @@ class Solution(AuditableResult):
     def to_xarray(self, units: Mapping[str, str] | None = None) -> xarray.Dataset:
         """Return an ``xarray.Dataset`` with coordinate ``time`` and all series; the rest is in attributes (JSON).
 
-        Each variable has a long name, energy and entropy also the law that the system promises of them. A body with
+        Each variable has a long name; those of energy and entropy state the law that they obey. A body with
         attitudes has its ``quaternion``, ``nutation``, ``precession`` and ``spin`` too [:mod:`liethermo.bodies`], and
         every rigid body its ``angular_velocity`` in body axes; the attribute ``comment`` states the convention.
 

@@ -184,7 +184,7 @@ def _parse_file(path: Path) -> dict[str, Any]:
         raise
     except ValueError as error:
         if "\0" in str(path):
-            raise FileError(f"cannot read the spec file {str(path)!r:.200}: it is no path") from error
+            raise FileError(f"cannot read the spec file {str(path)!r:.200}: it is not a path") from error
         raise SpecError(path, [f"it is not valid TOML: {error}"]) from error
 
 
@@ -218,7 +218,7 @@ def _apply_change(table: dict[str, Any], change: str, problems: list[str]) -> No
     for part in parts[:-1]:
         table = table.setdefault(part, {})
         if not isinstance(table, dict):
-            problems.append(f"--set {change}: {part} is no section")
+            problems.append(f"--set {change}: {part} is not a section")
             return
     table[parts[-1]] = value
 
