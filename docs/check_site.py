@@ -55,7 +55,7 @@ WORDS = {
 }
 """What a reader looks for, and what a title or an excerpt of the answer holds."""
 
-SHOWN = (
+CLASS_MEMBERS = (
     "index",
     "start/index",
     "tutorials/index",
@@ -303,7 +303,7 @@ def check_sources(docs: Path) -> list[str]:
 
 
 def take_pictures(chromium: Browser, html: Path) -> None:
-    for name, width in itertools.product(SHOWN, WIDTHS):
+    for name, width in itertools.product(CLASS_MEMBERS, WIDTHS):
         chromium.resize(width)
         chromium.open((html / f"{name}.html").as_uri())
         for theme in ("light", "dark"):

@@ -7,11 +7,17 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import warnings
 
 import manifolds  # noqa: F401  (switches 64-bit mode on before anything is traced)
 from manifolds._names import public_dir
 
-from . import bodies, models, testing
+from . import (
+    _class_members,  # noqa: F401  (what help() lists of the classes)
+    bodies,
+    models,
+    testing,
+)
 from .dissipation.adiabatic import AdiabaticJumps
 from .dissipation.base import Dissipation
 from .dissipation.bath_conduction import BathConduction
@@ -26,7 +32,7 @@ from .dissipation.landau_lifshitz import LandauLifshitz
 from .dissipation.lindblad import LindbladJumps
 from .dissipation.local_metric import LocalProjectedMetric
 from .dissipation.potential import ActivatedFriction, CoulombFriction, DissipationPotential, PowerLawFriction
-from .dissipation.projected_metric import GlobalRateWarning, ProjectedMetric
+from .dissipation.projected_metric import ProjectedMetric
 from .dissipation.quantum import ThermalJumps
 from .dissipation.steepest_ascent import SteepestEntropyAscent
 from .errors import (
@@ -53,7 +59,6 @@ from .functions.piecewise import PiecewiseConstant
 from .integrators import (
     DiscreteHerglotz,
     FiniteDifference,
-    InCharts,
     KrausMethod,
     LieVariational,
     MetriplecticGauss,
@@ -64,7 +69,6 @@ from .integrators import (
     Reference,
     VariationalGauss,
     VariationalIntegrator,
-    WithAttitude,
     registered_methods,
 )
 from .models import torques
@@ -88,13 +92,10 @@ from .studies.progress import StudyStatus
 from .studies.store_results import load_study
 from .studies.study import Study
 from .systems import (
-    AttitudeSystem,
-    ChartSystem,
     ChetaevSystem,
     ComposedSystem,
     ContactSystem,
     Copies,
-    DrivenSystem,
     Equilibria,
     Equilibrium,
     EulerPoincareClosedSystem,
@@ -126,12 +127,10 @@ __all__ = [
     "Adaptive",
     "AdiabaticJumps",
     "At",
-    "AttitudeSystem",
     "Audit",
     "AxiomError",
     "BathConduction",
     "CasimirError",
-    "ChartSystem",
     "ChetaevSystem",
     "ComposedSystem",
     "ContactSystem",
@@ -144,7 +143,6 @@ __all__ = [
     "Dissipation",
     "DissipationPotential",
     "DoubleBracket",
-    "DrivenSystem",
     "Each",
     "Energy",
     "Ensemble",
@@ -163,12 +161,10 @@ __all__ = [
     "FrictionOperator",
     "Function",
     "FunctionError",
-    "GlobalRateWarning",
     "Gonzalez",
     "Graph",
     "HeatBaths",
     "Herglotz",
-    "InCharts",
     "IndefiniteError",
     "IndexOutOfRangeError",
     "InnerProductDissipation",
@@ -224,7 +220,6 @@ __all__ = [
     "VariationalGauss",
     "VariationalIntegrator",
     "VonNeumann",
-    "WithAttitude",
     "Zipped",
     "bodies",
     "ensemble",
@@ -254,6 +249,16 @@ __all__ = [
 
 _INTEROP = ("diffrax", "scipy", "sympy")
 
+_DEPRECATED_TYPES = {
+    "AttitudeSystem": ".systems",
+    "ChartSystem": ".systems",
+    "DrivenSystem": ".systems",
+    "GlobalRateWarning": ".dissipation.projected_metric",
+    "InCharts": ".integrators",
+    "WithAttitude": ".integrators",
+}
+"""Modules of types that only the library makes; they were public names in 0.2."""
+
 
 __dir__ = public_dir(__all__, "__version__")
 
@@ -265,6 +270,14 @@ def __getattr__(name: str):
         return importlib.import_module(".learn", __name__)
     if name in _INTEROP:  # each imports the package that it is named after
         return importlib.import_module(f".interop.{name}", __name__)
+    if name in _DEPRECATED_TYPES:
+        module = importlib.import_module(_DEPRECATED_TYPES[name], __name__)
+        warnings.warn(
+            f"liethermo.{name} will be removed, since only the library makes it; it is {module.__name__}.{name}",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return getattr(module, name)
     if name == "__version__":
         return importlib.metadata.version("liethermo")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

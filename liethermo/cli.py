@@ -1,4 +1,4 @@
-"""The command line. Each command imports what it needs itself, so that ``--help`` is quick."""
+"""The command line. Commands import pydantic, Matplotlib, rich and Dask themselves, so that ``--help`` is quick."""
 
 from __future__ import annotations
 
@@ -13,13 +13,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from manifolds import ManifoldsError
+
+from . import __version__
+from . import models as catalogue
+from .errors import AxiomError, FileError, InputError, LiethermoError
+from .integrators import registered_methods
+from .results.audit import Audit
+from .results.ensemble import Ensemble
+from .results.load import load
+from .results.solution import Solution
+from .runs.integrate import integrate
+from .studies.store_results import load_status, load_study
+from .systems import System
+from .systems.check import CheckReport
+
 if TYPE_CHECKING:
-    from .results.audit import Audit
-    from .results.ensemble import Ensemble
-    from .results.solution import Solution
     from .spec import Spec
-    from .systems import System
-    from .systems.check import CheckReport
 
 EXIT_LAWS_FAILED = 1
 """Exit status if a law or an axiom fails, or the run stopped early."""
@@ -39,9 +49,7 @@ app = typer.Typer(
 
 def _print_version(is_requested: bool) -> None:
     if is_requested:
-        from importlib.metadata import version
-
-        typer.echo(f"liethermo {version('liethermo')}")
+        typer.echo(f"liethermo {__version__}")
         raise typer.Exit
 
 
@@ -68,10 +76,6 @@ SpecFile = Annotated[Path, typer.Argument(metavar="SPEC.toml", help="The run, de
 @contextlib.contextmanager
 def _report_errors() -> Iterator[None]:
     """Print errors of the library as a message and exit with a status, without a traceback."""
-    from manifolds import ManifoldsError
-
-    from .errors import AxiomError, LiethermoError
-
     try:
         yield
     except (LiethermoError, ManifoldsError) as error:
@@ -90,7 +94,6 @@ def run(
     allow: AllowedModules = None,
 ) -> None:
     """Run a spec file: integrate, audit the laws, and write result, figures and a copy of the spec into a folder."""
-    from .runs.integrate import integrate
     from .spec import read
 
     plan = read(spec, change or (), allow or ())
@@ -154,8 +157,6 @@ def study(
 @_report_errors()
 def status(store: StoreFolder) -> None:
     """Print the progress of the study in a store, also while it runs."""
-    from .studies.store_results import load_status
-
     typer.echo(str(load_status(store)))
 
 
@@ -193,8 +194,6 @@ def models() -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from . import models as catalogue
-
     table = Table("model", "parameters", "what it is", box=None, pad_edge=False)
     for name in catalogue.__all__:
         model = getattr(catalogue, name)
@@ -209,8 +208,6 @@ def methods() -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from .integrators import registered_methods
-
     table = Table("method", "order", "keeps exactly", "for", box=None, pad_edge=False)
     for method in registered_methods(special=True):
         guarantees = ", ".join(sorted(name.replace("_", " ") for name in method.preserves))
@@ -222,8 +219,6 @@ def methods() -> None:
 @_report_errors()
 def audit(file: Annotated[Path, typer.Argument(metavar="FILE.nc", help="A result of `liethermo run`.")]) -> None:
     """Audit the laws of a saved run."""
-    from .results.load import load
-
     solution = load(file)
     typer.echo(
         f"{file}: {solution.provenance.get('system', 'a system')}, {solution.provenance.get('method', 'a method')}"
@@ -241,8 +236,6 @@ def main() -> None:
 
 def _prepare_result_folder(spec: Path, folder: Path) -> Path:
     """Create the folder of the results and copy the spec into it, so that an unwritable folder fails at once."""
-    from .errors import FileError
-
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(shutil.SameFileError):
@@ -268,8 +261,6 @@ def _draw_figures(plan: Spec, system: System, solution: Solution, folder: Path) 
 
 def _print_audit(result: Solution | Ensemble) -> bool:
     """Print the status of a run or an ensemble and its audit; return True if all laws hold."""
-    from .results.solution import Solution
-
     audit = result.audit()
     if isinstance(result, Solution):
         typer.echo(f"{result.status} ({result.stats.wall_time:.1f} s)")
@@ -293,7 +284,6 @@ def _dask_client(address: str | None, folder: Path) -> Iterator[Any]:
         return
     from distributed import Client
 
-    from .errors import FileError
     from .spec.trust import pickling_by_value
 
     try:
@@ -307,9 +297,7 @@ def _dask_client(address: str | None, folder: Path) -> Iterator[Any]:
 def _draw_study(store: Path, measure: str | None, file: Path) -> None:
     """Draw a measure of a store into a file; without a named measure, an undrawable store only prints the reason."""
     os.environ.setdefault("MPLBACKEND", "agg")
-    from .errors import InputError
     from .results.plot import study as draw_study
-    from .studies.store_results import load_study
 
     try:
         draw_study(load_study(store), measure, file)

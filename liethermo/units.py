@@ -148,6 +148,26 @@ def parse_unit(name: str) -> Unit:
     return Unit(factor, 0.0, tuple(sorted((base, exponent) for base, exponent in exponents.items() if exponent)))
 
 
+QUANTITY_PATTERN = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(\S.*)")
+"""A number and its unit, such as ``0.5 deg/s``."""
+
+
+def quantity_in_si(text: str) -> float:
+    """Return the number in SI units of a text with a number and a unit, such as ``0.5 deg/s``.
+
+    It is a difference: 1 degC is 1 K.
+
+    Raises
+    ------
+    InputError
+        If it is no number with a known unit.
+    """
+    match = QUANTITY_PATTERN.fullmatch(text)
+    if match is None:
+        raise InputError(f"{text!r} is no number with a unit, such as '0.5 deg/s'")
+    return float(match[1]) * parse_unit(match[2]).factor
+
+
 def _simple_unit(name: str) -> tuple[float, dict[str, int]] | None:
     """Return the factor and the exponents of a unit without exponent; None if it is not known."""
     name = SYNONYMS.get(name, name)

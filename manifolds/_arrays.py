@@ -65,13 +65,21 @@ def _require_numeric_dtype(array: np.ndarray) -> np.ndarray:
 def real_array(value) -> jax.Array:
     """Return ``value`` as a JAX array of doubles.
 
-    NumPy converts plain numbers, because XLA would compile a program for the conversion.
+    NumPy converts plain numbers, and the type is named, because XLA would compile a program for the conversion.
     """
     if isinstance(value, jax.Array):
         return value if value.dtype == jnp.float64 else value.astype(jnp.float64)
     if is_traced(value):  # a list with traced entries
         return jnp.asarray(value, dtype=jnp.float64)
-    return jnp.asarray(np.asarray(value, dtype=np.float64))
+    return jnp.asarray(np.asarray(value, dtype=np.float64), dtype=jnp.float64)
+
+
+def host_array(value):
+    """Return numbers as a NumPy array, with which NumPy computes; traced ones as they are, with which JAX computes.
+
+    For an operation on a JAX array of numbers XLA would compile a program.
+    """
+    return value if is_traced(value) else np.asarray(value)
 
 
 MAX_SELECT_COLUMNS = 4

@@ -9,10 +9,26 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import equinox as eqx
 import jax
 
+from ._class_members import listed_names
+
 Copied = TypeVar("Copied", bound=eqx.Module)
 
 
-class Module(eqx.Module):
+if TYPE_CHECKING:
+    from equinox._module._module import _ModuleMeta as ListedModuleType
+else:
+
+    class ListedModuleType(type(eqx.Module)):
+        """Type of the classes of pytrees: ``dir`` of a class, and so ``help``, lists the members that users call.
+
+        What an instance has is listed in full.
+        """
+
+        def __dir__(cls) -> list[str]:
+            return listed_names(cls)
+
+
+class Module(eqx.Module, metaclass=ListedModuleType):
     """Equinox module whose methods are ordinary bound methods, except when they become fields of another module.
 
     Equinox makes a pytree of each method that is looked up, which takes a good part of the time to trace a step and of

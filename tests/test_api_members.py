@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import pydoc
 import re
 import sys
 from pathlib import Path
@@ -55,10 +56,10 @@ def test_each_member_of_the_table_exists_and_is_described():
         if base.__module__.startswith(api_members.LIBRARY)
         and not base.__module__.startswith("liethermo.learn")  # its names repeat those of base classes
     }
-    assert set(api_members.SHOWN) <= set(owners)
+    assert set(api_members.CLASS_MEMBERS) <= set(owners)
     absent = [
         f"{name}.{member}"
-        for name, members in api_members.SHOWN.items()
+        for name, members in api_members.CLASS_MEMBERS.items()
         for member in members
         if not hasattr(owners[name], member) or not api_members.is_documented(owners[name], member)
     ]
@@ -125,3 +126,50 @@ def test_no_summary_begins_with_a_formula():
 @pytest.mark.parametrize("line", ["``x' = f(x)`` on R^n.", ":math:`x`, a state.", "x' = f(x) on R^n."])
 def test_a_summary_that_begins_with_a_formula_is_found(line):
     assert FORMULA.match(line)
+
+
+# -- help() -----------------------------------------------------------------------------------------------------------
+
+HELP_LINES = {
+    liethermo.LiePoissonSystem: 170,
+    liethermo.MetriplecticSystem: 125,
+    liethermo.EulerPoincareSystem: 125,
+    liethermo.SpinSystem: 145,
+    liethermo.MetriplecticGauss: 100,
+    liethermo.MetriplecticRungeKutta: 100,
+    liethermo.Quadratic: 60,
+    liethermo.KillingDissipation: 60,
+    liethermo.DoubleBracket: 60,
+}
+"""Classes that users meet first, and the largest number of lines of their help: 580 of the first with internals.
+
+Between 40 and 80 of them are the description of the class itself."""
+
+
+@pytest.mark.parametrize("owner", HELP_LINES, ids=lambda owner: owner.__name__)
+def test_help_lists_what_users_call(owner):
+    text = pydoc.render_doc(owner, renderer=pydoc.plaintext)
+    assert text.count("\n") <= HELP_LINES[owner]
+    values = {name for name in dir(owner) if api_members.is_value(owner, name)}  # such as ``explicit = True``
+    assert set(dir(owner)) - values == set(api_members.shown_members(owner))
+    for name in dir(owner):
+        assert f" {name}" in text
+
+
+def test_help_of_an_instance_is_complete():
+    """Only the lists of classes are shortened: an instance lists all it has, and attributes are read as before."""
+    method = liethermo.MetriplecticGauss(2)
+    assert {"stages", "slopes", "order"} <= set(dir(method))
+    assert liethermo.MetriplecticGauss.slopes is type.__getattribute__(liethermo.MetriplecticGauss, "slopes")
+
+
+def test_help_of_a_class_of_a_user_lists_its_own_members():
+    class Pendulum(liethermo.MetriplecticSystem):
+        def length(self):
+            """Return its length."""
+
+        def _internal(self):
+            """Return something."""
+
+    assert {"length", "vector_field"} <= set(dir(Pendulum))
+    assert "_internal" not in dir(Pendulum)

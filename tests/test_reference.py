@@ -92,6 +92,15 @@ def test_modules_show_what_is_public_and_nothing_else(name):
     assert public_modules <= (set() if inner else {*MODULES})
 
 
+@pytest.mark.parametrize("name", liethermo._DEPRECATED_TYPES)
+def test_a_deprecated_type_is_told_its_new_place(name):
+    with pytest.warns(DeprecationWarning, match=f"liethermo.{name} will be removed") as record:
+        kind = getattr(liethermo, name)
+    module, _, attribute = str(record[0].message).rpartition(" ")[2].rpartition(".")
+    assert kind is getattr(sys.modules[module], attribute)
+    assert name not in liethermo.__all__
+
+
 def test_an_argument_that_nobody_tells_is_found():
     arguments, attributes = _table_names()
     assert {"x", "system", "compensation"} <= arguments

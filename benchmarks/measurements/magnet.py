@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import liethermo as lt
+from liethermo.functions.magnetism.transitions import autocorrelation_time
 
 from ..heat_bath import sample_heat_bath
 from ..report import Report, Table, Target
@@ -58,13 +59,22 @@ class Series:
         return self.samples[:, 0]
 
     @property
+    def magnetisation_vectors(self) -> np.ndarray:
+        return self.samples[:, 1:]
+
+    @property
     def squared_magnetisation(self) -> np.ndarray:
-        return (self.samples[:, 1:] ** 2).sum(axis=1)
+        return (self.magnetisation_vectors**2).sum(axis=1)
+
+    def magnet_samples(self) -> lt.magnetism.MagnetSamples:
+        """Return the samples with the energy of all spins."""
+        energy = self.energy * self.length**3
+        return lt.magnetism.MagnetSamples(self.temperature, energy, self.magnetisation_vectors)
 
     @property
     def autocorrelation_time(self) -> float:
         """The integrated autocorrelation time of m², in rows, with a window of six times its value [Sokal 1997]."""
-        return integrated_autocorrelation(self.squared_magnetisation)
+        return autocorrelation_time(self.squared_magnetisation)
 
     @property
     def row_indices(self) -> np.ndarray:
@@ -75,9 +85,7 @@ class Series:
         """Return the series without its beginning: a twentieth, or eight autocorrelation times if that is at most
         half."""
         n = len(self.samples)
-        n_skipped = max(
-            n // 20, min(n // 2, int(8 * integrated_autocorrelation(self.squared_magnetisation[n // 10 :])))
-        )
+        n_skipped = max(n // 20, min(n // 2, int(8 * autocorrelation_time(self.squared_magnetisation[n // 10 :]))))
         return replace(self, samples=self.samples[n_skipped:])
 
     def jackknife_blocks(self) -> list[np.ndarray]:
@@ -86,30 +94,12 @@ class Series:
         return np.array_split(self.row_indices, count)
 
 
-def integrated_autocorrelation(x: np.ndarray) -> float:
-    x = x - x.mean()
-    spectrum = np.fft.rfft(x, 2 * len(x))
-    correlation = np.fft.irfft(spectrum * spectrum.conj())[: len(x)]
-    total = 0.5
-    for lag, value in enumerate(correlation[1:] / correlation[0], start=1):
-        total += value
-        if lag > 6 * total:
-            break
-    return float(total)
-
-
 def magnetisation(series: Series, rows) -> float:
     return float(np.sqrt(series.squared_magnetisation[rows]).mean())
 
 
 def specific_heat(series: Series, rows) -> float:
     return float(series.energy[rows].var() * series.length**3 / series.temperature**2)
-
-
-def binder_cumulant(series: Series, rows) -> float:
-    """Return Binder's cumulant ``1 - <m^4> / 3 <m^2>^2``."""
-    square = series.squared_magnetisation[rows]
-    return float(1.0 - (square**2).mean() / (3.0 * square.mean() ** 2))
 
 
 def with_error(quantity, series: Series) -> tuple[float, float]:
@@ -123,30 +113,6 @@ def jackknife_variance(quantity, series: Series) -> float:
     """Return the jackknife variance of a function of row indices."""
     estimates = [quantity(np.delete(series.row_indices, block)) for block in series.jackknife_blocks()]
     return float((len(estimates) - 1) * np.var(estimates))
-
-
-def cumulant_slope(series: Series, rows) -> float:
-    """Return the temperature derivative of the cumulant, from correlations of m² and m⁴ with the energy."""
-    energy, square = series.energy[rows] * series.length**3, series.squared_magnetisation[rows]
-    second, fourth = square.mean(), (square**2).mean()
-    changes = [((x - x.mean()) * energy).mean() / series.temperature**2 for x in (square, square**2)]
-    return float((2.0 * fourth * changes[0] / second - changes[1]) / (3.0 * second**2))
-
-
-def cumulant_crossing(a: Series, b: Series) -> tuple[float, float]:
-    """Return the temperature at which the cumulants of two lattices are equal, and its standard error.
-
-    Both runs have one temperature; each cumulant is extrapolated linearly from there.
-    """
-    temperature = a.temperature
-
-    def crossing(rows_a, rows_b) -> float:
-        difference = binder_cumulant(a, rows_a) - binder_cumulant(b, rows_b)
-        return temperature - difference / (cumulant_slope(a, rows_a) - cumulant_slope(b, rows_b))
-
-    variance_a = jackknife_variance(lambda of_a: crossing(of_a, b.row_indices), a)
-    variance_b = jackknife_variance(lambda of_b: crossing(a.row_indices, of_b), b)
-    return crossing(a.row_indices, b.row_indices), float(np.sqrt(variance_a + variance_b))
 
 
 def join_runs(runs: list[Series]) -> Series:
@@ -208,7 +174,8 @@ def run(is_quick: bool) -> Report:
 
 def series_row(series: Series) -> list:
     """Return a row of the table: the results of a series with their standard errors."""
-    quantities = [with_error(f, series) for f in (magnetisation, specific_heat, binder_cumulant)]
+    cumulant = lt.magnetism.binder_cumulant(series.magnetisation_vectors)
+    quantities = [*(with_error(f, series) for f in (magnetisation, specific_heat)), tuple(cumulant)]
     times = series.autocorrelation_time * series.steps_per_row
     return [series.generator, series.length, f"{series.temperature:g}", series.steps, times, *sum(quantities, ())]
 
@@ -217,7 +184,8 @@ def crossing_rows(series_list: list[Series]) -> list[list]:
     """Return for each pair of lattices the crossing, its error, the number of blocks, and the relative deviation."""
     rows = []
     for a, b in itertools.combinations(sorted(series_list, key=lambda series: series.length), 2):
-        (T, error), blocks = cumulant_crossing(a, b), min(len(series.jackknife_blocks()) for series in (a, b))
+        T, error = lt.magnetism.cumulant_crossing(a.magnet_samples(), b.magnet_samples())
+        blocks = min(len(series.jackknife_blocks()) for series in (a, b))
         rows.append([f"{a.length}³ and {b.length}³", T, error, blocks, abs(T / CRITICAL_TEMPERATURE - 1.0)])
     return rows
 

@@ -244,11 +244,16 @@ def fields(owner: Any) -> set[str]:
     return {name for base in bases for name in getattr(base, "__annotations__", ())}
 
 
+def all_names(owner) -> list[str]:
+    """Return all names of a module or a class, those that ``dir`` leaves out included."""
+    return dir(owner) if inspect.ismodule(owner) else list(type.__dir__(owner))
+
+
 @functools.cache
 def attributes(cls: type) -> frozenset[str]:
     """Of the class, those that it declares without a value, and those that its constructor sets."""
     code = getattr(cls.__init__, "__code__", None)
-    return frozenset({*dir(cls), *fields(cls), *(code.co_names if code is not None else ())})
+    return frozenset({*all_names(cls), *fields(cls), *(code.co_names if code is not None else ())})
 
 
 def classes_of(value: ast.expr) -> list[type]:
@@ -273,7 +278,9 @@ def functions(name: str) -> list[Callable]:
 def instances(name: str) -> list[Callable]:
     """The call of an instance of a class of this name: ``solution(t)``."""
     return [
-        _of_instance(cls, "__call__") for cls in classes() if cls.__name__.lower() == name and "__call__" in dir(cls)
+        _of_instance(cls, "__call__")
+        for cls in classes()
+        if cls.__name__.lower() == name and "__call__" in all_names(cls)
     ]
 
 
@@ -290,7 +297,9 @@ def parameters() -> dict[str, list[Any]]:
     for package in (liethermo, manifolds):
         for owner in (package, *(getattr(package, name) for name in package.__all__)):
             has_members = inspect.ismodule(owner) or inspect.isclass(owner)
-            members = [getattr(owner, name) for name in dir(owner) if not name.startswith("_")] if has_members else []
+            members = (
+                [getattr(owner, name) for name in all_names(owner) if not name.startswith("_")] if has_members else []
+            )
             for member in filter(callable, (owner, *members)):
                 try:
                     names = inspect.signature(member).parameters

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 import manifolds as mf
+from manifolds._arrays import real_array
 from manifolds._pytree_module import Module
 
 from ..functions.energy import Energy
@@ -75,7 +76,7 @@ class Geometry(Module):
         """Return state vectors, shape (..., n), in their natural shape: ``(*sites, d)``, or points of the space."""
         if self.space is not None:
             return self.space.from_vector(x)
-        x = jnp.asarray(x)
+        x = real_array(x)
         return x.reshape(*x.shape[:-1], *self.shape) if self.sites else x
 
     # -- the metric of the space --------------------------------------------------------------------------------------

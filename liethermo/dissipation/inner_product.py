@@ -7,10 +7,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._arrays import real_array
 
 from ..errors import IndefiniteError, InputError
 from .base import Dissipation
@@ -143,7 +143,7 @@ class KillingDissipation(BracketDissipation):
                 f"{g.name} is solvable: its Killing form vanishes on brackets, so KillingDissipation would do nothing. "
                 "Instead use ProjectedMetric() or InnerProductDissipation(K)"
             )
-        return dataclasses.replace(self, form=jnp.asarray(form) if isinstance(form, np.ndarray) else form)
+        return dataclasses.replace(self, form=real_array(form))
 
     def added_momentum(self, dH, bracket_dH_dS):
         return self.rate * (self.form @ bracket_dH_dS)

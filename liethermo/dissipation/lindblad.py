@@ -16,7 +16,7 @@ from manifolds.matrices.linear import adjoint
 from ..errors import InputError
 from .base import Dissipation
 from .checks import checked_rate
-from .operators import Operator, checked_hermitian, checked_square_matrix, get_density_structure
+from .operators import HasMatrix, Operator, checked_hermitian, checked_square_matrix, get_density_structure
 
 
 class LindbladJumps(Dissipation):
@@ -33,9 +33,10 @@ class LindbladJumps(Dissipation):
     Parameters
     ----------
     couplings : list of (V, rate)
-        V is a dimensionless matrix, shape (N, N), or a ``Qobj``. The rate is a number >= 0 (1 / time), or a function of
-        the time t to one. A rate that becomes negative is not refused, but the motion may then leave the density
-        matrices.
+        V is a dimensionless matrix, shape (N, N), or a ``Qobj``; or a function of the time t to an array, written with
+        jax.numpy, such as ``lambda t: V0 + jnp.exp(1j * w * t) * V1``. The rate is a number >= 0 (1 / time), or a
+        function of the time t to one. A rate that becomes negative is not refused, but the motion may then leave the
+        density matrices.
 
     Raises
     ------
@@ -54,7 +55,7 @@ class LindbladJumps(Dissipation):
     True
     """
 
-    operators: tuple[Operator, ...] = eqx.field(static=True)
+    operators: tuple[Operator | OperatorFunction, ...]
     rates: tuple[Any, ...]
 
     energy_law = None
@@ -68,9 +69,7 @@ class LindbladJumps(Dissipation):
         pairs = list(couplings)
         if not pairs or not all(isinstance(pair, tuple | list) and len(pair) == 2 for pair in pairs):
             raise InputError("couplings must be a list of pairs (V, rate), such as [(V, 0.1)]")
-        self.operators = tuple(
-            Operator(checked_square_matrix(V, f"the jump operator V[{i}]")) for i, (V, _) in enumerate(pairs)
-        )
+        self.operators = tuple(_checked_operator(V, f"the jump operator V[{i}]") for i, (V, _) in enumerate(pairs))
         self.rates = tuple(
             _checked_function(rate, i) if callable(rate) else checked_rate(rate) for i, (_, rate) in enumerate(pairs)
         )
@@ -106,15 +105,16 @@ class LindbladJumps(Dissipation):
 
     @property
     def depends_on_time(self) -> bool:
-        """True if a rate is a function of time."""
-        return any(callable(rate) for rate in self.rates)
+        """True if a rate or an operator is a function of time."""
+        return any(callable(value) for value in (*self.rates, *self.operators))
 
     def bind_to(self, system):
         size = get_density_structure(system, "LindbladJumps").size
         for i, V in enumerate(self.operators):
-            if np.shape(V) != (size, size):
+            shape = V.shape if isinstance(V, OperatorFunction) else np.shape(V)
+            if shape != (size, size):
                 raise InputError(
-                    f"the jump operator V[{i}] has shape {np.shape(V)}, but the Hamiltonian has shape ({size}, {size})"
+                    f"the jump operator V[{i}] has shape {shape}, but the Hamiltonian has shape ({size}, {size})"
                 )
         return self
 
@@ -123,7 +123,7 @@ class LindbladJumps(Dissipation):
 
     def generator_field(self, system, x, dH):
         structure, n = system.structure, system.body_dim
-        rates, rho, V = self.rates_at(system.time), structure.matrix(x[:n]), self.stacked_operators()
+        rates, rho, V = self.rates_at(system.time), structure.matrix(x[:n]), self.operators_at(system.time)
         gain = jnp.sum(rates[:, None, None] * (V @ rho @ adjoint(V)), axis=0)
         loss = jnp.tensordot(rates, jnp.asarray(adjoint(V) @ V), 1) @ rho  # its Hermitian part is the anticommutator
         return jnp.pad(structure.vector(gain - loss), (0, system.dim - n))
@@ -140,25 +140,67 @@ class LindbladJumps(Dissipation):
         observable : array, shape (N, N)
             A, Hermitian.
         t : float
-            The time, if a rate depends on it.
+            The time, if a rate or an operator depends on it.
         """
-        A, V = checked_hermitian(observable, "the observable"), self.stacked_operators()
+        time = jnp.asarray(t, dtype=jnp.float64)
+        A, V = checked_hermitian(observable, "the observable"), self.operators_at(time)
         if A.shape != V.shape[1:]:
             raise InputError(f"the observable has shape {A.shape}, and the jump operators {V.shape[1:]}")
         squares = adjoint(V) @ V
         dual = adjoint(V) @ A @ V - 0.5 * (squares @ A + A @ squares)  # the adjoint map of each jump
-        total = jnp.tensordot(self.rates_at(jnp.asarray(t, dtype=jnp.float64)), jnp.asarray(dual), 1)
+        total = jnp.tensordot(self.rates_at(time), jnp.asarray(dual), 1)
         return jnp.einsum("ij,...ji->...", total, jnp.asarray(rho)).real
 
     def rates_at(self, time) -> jax.Array:
         """Return the rates at a time, shape (jumps,); the time may be None if they do not depend on it."""
-        if self.depends_on_time and time is None:
-            raise InputError("a rate of LindbladJumps depends on time: take system.at_time(t)")
+        self._require_time(time)
         return jnp.stack([jnp.asarray(rate(time)) if callable(rate) else rate for rate in self.rates])
 
-    def stacked_operators(self) -> np.ndarray:
-        """Return the jump operators, shape (jumps, N, N)."""
-        return np.stack([np.asarray(operator) for operator in self.operators])
+    def operators_at(self, time) -> np.ndarray | jax.Array:
+        """Return the jump operators at a time, shape (jumps, N, N); the time may be None if nothing depends on it."""
+        self._require_time(time)
+        if not any(isinstance(V, OperatorFunction) for V in self.operators):
+            return np.stack([np.asarray(V) for V in self.operators])  # constants of a program
+        return jnp.stack(
+            [V(time) if isinstance(V, OperatorFunction) else jnp.asarray(np.asarray(V)) for V in self.operators]
+        )
+
+    def _require_time(self, time) -> None:
+        if self.depends_on_time and time is None:
+            raise InputError("a rate or an operator of LindbladJumps depends on time: take system.at_time(t)")
+
+
+class OperatorFunction(Module):
+    """A jump operator that depends on time.
+
+    Attributes
+    ----------
+    function : function from t, shape (), to an array, shape (N, N)
+    shape : tuple of int
+        Shape of its values.
+    """
+
+    function: Callable
+    shape: tuple[int, ...] = eqx.field(static=True)
+
+    def __call__(self, t) -> jax.Array:
+        return jnp.asarray(self.function(t), dtype=jnp.complex128)
+
+
+def _checked_operator(V: Any, what: str) -> Operator | OperatorFunction:
+    """Return a jump operator as a matrix, or as a function of time, tested at t = 0."""
+    if not callable(V) or isinstance(V, HasMatrix):
+        return Operator(checked_square_matrix(V, what))
+    try:
+        value = V(0.0)
+    except TypeError as error:
+        raise InputError(f"{what} must be a matrix, or a function of the time t: {error}") from None
+    if isinstance(value, HasMatrix):
+        raise InputError(
+            f"{what} is a function that returns a Qobj, which JAX cannot trace. Return an array of jax.numpy, such as "
+            "jnp.cos(t) * V.full()"
+        )
+    return OperatorFunction(V, checked_square_matrix(value, what).shape)
 
 
 class _SquaredFactor(Module):

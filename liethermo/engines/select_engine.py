@@ -20,7 +20,6 @@ from .array_engine import ArrayEngine, EngineTrajectory
 from .compiled.lanes import CompiledAdaptiveRuns
 from .compiled.step_loop import CompiledEngine, CompiledTrajectory
 from .sparse.engine import SparseEngine
-from .status_codes import StatusCode
 from .step import SavedStates, State
 from .step_control import StepControl
 
@@ -46,7 +45,7 @@ MIN_SPARSE_DIM = 200
 """Smallest dimension for which "auto" picks the sparse engine for a system with a known sparsity pattern."""
 
 
-SUBSTEP_COUNTS = (1, 2, 4, 8, 16)
+SUBSTEP_COUNTS = (2, 4, 8, 16)
 """Numbers of substeps into which a partial step is divided, tried in this order until it succeeds."""
 
 
@@ -144,24 +143,13 @@ class EngineWithFallback:
         noise = self._noise_increments(state, 1, h)
         return self._call_with_fallback(lambda engine, state: engine.step(state, h, noise), state)
 
-    def partial_step(self, state: State, h: float) -> State:
-        """Return the state after a step of size h that is a part of a step of the run.
-
-        If the partial step fails it is divided into substeps. If they fail too, the status says why.
-        """
-        for substeps in SUBSTEP_COUNTS:
-            new_state = self.advance(state, h / substeps, 1, substeps)[0]
-            if int(new_state.status) == StatusCode.COMPLETED:
-                break
-        return new_state
-
     def step_ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
         """Return the end states, shape (m, n), of partial steps of sizes h from states x.
 
         A partial step that fails is divided into substeps; the result is NaN if they fail too.
         """
         ends = np.array(self._engine_step_ends(x, h))
-        for substeps in SUBSTEP_COUNTS[1:]:
+        for substeps in SUBSTEP_COUNTS:
             is_missing = np.isnan(ends).any(axis=1) & np.isfinite(x).all(axis=1)
             if not is_missing.any():
                 break

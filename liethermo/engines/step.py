@@ -14,6 +14,7 @@ from ..integrators import OneStepMethod
 from ..integrators.base import is_permutation_equivariant, pullback_method
 from ..integrators.explicit import StepRow
 from ..systems import System
+from ..systems.clock import add_jump_of_energy, clock_components, system_of_step
 from ..systems.spins import reorder_spins
 from ..tracing.programs import jit_unoptimised
 from .solver_options import DEFAULT_OPTIONS, EPS, SolverOptions
@@ -148,9 +149,9 @@ def start_step(system: System, x, energy_before) -> tuple[System, jax.Array]:
     energy_before : array, shape ()
         The energy at the end of the last step, before a jump.
     """
-    step_system = system.system_of_step(x)
-    if system.energy_jumps:
-        x = system.add_jump_of_energy(x, step_system.energy.value(x) - energy_before)
+    step_system = system_of_step(system, x)
+    if system.clock is not None and system.clock.energy_jumps:
+        x = add_jump_of_energy(system.clock, x, step_system.energy.value(x) - energy_before)
     return step_system, x
 
 
@@ -222,7 +223,7 @@ def finish_step(
     new_x, new_compensation, energy, entropy = end.x, end.compensation, end.energy, end.entropy
     correction = state.energy_drift_correction
     if not method.carries_compensation:  # the next step computes its own, as the first step of a run does
-        new_compensation = system.clock_components(new_compensation)
+        new_compensation = clock_components(system, new_compensation)
     elif can_correct_energy_drift(system, method):  # by the error of the last step: no step waits for its own energy
         new_compensation = compensation_after_drift_correction(system, new_x, new_compensation, correction)
         correction = energy_drift_correction(system, new_x, new_compensation, energy, state.first_energy)

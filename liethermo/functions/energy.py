@@ -38,7 +38,7 @@ from .coordinates import ComponentMap, Components, check_coordinates
 from .indices import clique_pattern, sparsity_pattern, union_pattern
 from .path import CollocationPath, DiscreteGradientScheme
 from .rounding import value_and_rounding_scale
-from .time_span import FunctionWithBreaks, TimeSpan, checked_breaks, declared_breaks
+from .time_span import DeclaredTimes, FunctionWithBreaks, TimeSpan, checked_breaks
 
 
 @subprogram
@@ -368,7 +368,11 @@ class TimeDependent(Energy, FunctionWithBreaks):
 
     @property
     def break_times(self) -> tuple[float, ...]:
-        return (*self.breaks, *declared_breaks(self.function))
+        return (*self.breaks, *DeclaredTimes.from_tree(self.function).jumps)
+
+    @property
+    def kink_times(self) -> tuple[float, ...]:
+        return DeclaredTimes.from_tree(self.function).kinks
 
     def at_time(self, t) -> Energy:
         return Function(FixedTimeFunction(self.function, jnp.asarray(t, dtype=jnp.float64)))

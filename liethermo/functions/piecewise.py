@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy  # its module of splines is loaded where one is used
 
+from manifolds._arrays import is_traced
 from manifolds._pytree_module import Module
 
 from ..errors import InputError
@@ -82,11 +83,13 @@ class PiecewiseConstant(FunctionWithBreaks):
         return jnp.where((t >= self.times[0]) & (t < self.times[-1]), value, jnp.zeros_like(value))
 
 
-class Table(Module):
+class Table(FunctionWithBreaks):
     """A function of time from a table; zero before the first time and after the last.
 
     The interval that contains t is found by bisection, so that the time for a value and for the first answer of a run
-    grows with the logarithm of the length of the table. The numbers are parameters.
+    grows with the logarithm of the length of the table. The numbers are parameters. The steps of a run end at the times
+    of a table joined by straight lines, and at the ends of others. They do not if the span has more than 1,000 of them,
+    or more than steps of a given size.
 
     Parameters
     ----------
@@ -160,6 +163,10 @@ class Table(Module):
             object.__setattr__(table, name, value)
         return table
 
+    @property
+    def kink_times(self) -> tuple[float, ...]:
+        return kinks_of_table(self.times, self.values is None)
+
     def __call__(self, t) -> jax.Array:
         times, n_intervals = jnp.asarray(self.times), self.times.shape[0] - 1
         i = interval_index(times, t)
@@ -172,6 +179,16 @@ class Table(Module):
             assert self.coefficients is not None
             value = _polynomial_value(jnp.asarray(self.coefficients)[i], t - start)
         return jnp.where((t >= times[0]) & (t <= times[n_intervals]), value, jnp.zeros(self.shape))
+
+
+def kinks_of_table(times: jax.Array, is_smooth: bool) -> tuple[float, ...]:
+    """Return the times at which a table has a kink: all of them, or the first and the last if its pieces are smooth.
+
+    There are none if the times are not known, because JAX traces them or they differ in an ensemble.
+    """
+    if is_traced(times) or not np.isfinite(times).all():
+        return ()
+    return tuple(np.asarray(times)[[0, -1] if is_smooth else slice(None)].tolist())
 
 
 class ContinuedSpline(Module):

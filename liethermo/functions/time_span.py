@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -106,18 +105,50 @@ def replace_time_span(tree, span: TimeSpan):
 
 
 class FunctionWithBreaks(Module):
-    """Base class of functions of time that jump at known times, where the steps of a run end by themselves."""
+    """Base class of functions of time that are not smooth at known times, where the steps of a run end."""
 
     @property
-    @abstractmethod
     def break_times(self) -> tuple[float, ...]:
         """Times at which the function jumps."""
+        return ()
+
+    @property
+    def kink_times(self) -> tuple[float, ...]:
+        """Times at which a derivative of the function jumps, as far as they depend on no parameter."""
+        return ()
 
 
-def declared_breaks(tree: Any) -> tuple[float, ...]:
-    """Return the times at which functions of time in a pytree, such as a system, say that they jump."""
-    nodes = jax.tree_util.tree_leaves(tree, is_leaf=lambda node: isinstance(node, FunctionWithBreaks))
-    return tuple(sorted({t for node in nodes if isinstance(node, FunctionWithBreaks) for t in node.break_times}))
+class DeclaredTimes(NamedTuple):
+    """Times at which functions of time in a pytree, such as a system, say that they are not smooth.
+
+    Attributes
+    ----------
+    jumps, kinks : tuple of float
+        Times at which a function, or one of its derivatives, jumps; in increasing order.
+    """
+
+    jumps: tuple[float, ...]
+    kinks: tuple[float, ...]
+
+    @classmethod
+    def from_tree(cls, tree: Any) -> DeclaredTimes:
+        """Return the times that the functions of time in a pytree declare."""
+        leaves = jax.tree_util.tree_leaves(tree, is_leaf=lambda node: isinstance(node, FunctionWithBreaks))
+        functions = [leaf for leaf in leaves if isinstance(leaf, FunctionWithBreaks)]
+        jumps, kinks = ({t for f in functions for t in times(f)} for times in (_jumps_of, _kinks_of))
+        return cls(tuple(sorted(jumps)), tuple(sorted(kinks)))
+
+
+TIMES_OF_SMOOTH_FUNCTIONS = DeclaredTimes((), ())
+"""The declared times of functions that are smooth."""
+
+
+def _jumps_of(function: FunctionWithBreaks) -> tuple[float, ...]:
+    return function.break_times
+
+
+def _kinks_of(function: FunctionWithBreaks) -> tuple[float, ...]:
+    return function.kink_times
 
 
 def checked_breaks(breaks) -> tuple[float, ...]:

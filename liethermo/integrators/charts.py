@@ -18,7 +18,7 @@ from .base import MethodWrapper, OneStepMethod, collocation_error_estimate, pull
 
 
 class InCharts(MethodWrapper):
-    """A method on a manifold, run step by step in coordinates around a point z: :class:`liethermo.ChartSystem`.
+    """A method on a manifold, run step by step in coordinates around a point z.
 
     The step from x to x' is a step in R^dim, from the coordinates of x to those of x'. So the laws that the method
     preserves hold exactly on the manifold, and x' is on it to rounding, without a projection. The order is that of the

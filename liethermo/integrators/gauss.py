@@ -77,7 +77,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     gradients between the nodes if s is 1 or 2.
 
     On a manifold the scheme runs in the arrays around it. With ``retraction`` it runs in the chart ``v -> R(x, v)``
-    around the state, a new chart in each step, with the same order and laws. See :class:`InCharts`.
+    around the state, a new chart in each step, with the same order and laws.
 
     Parameters
     ----------

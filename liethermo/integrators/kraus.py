@@ -134,7 +134,7 @@ class _Channel(NamedTuple):
     structure : manifolds.DensityMatrices
     order : int
     h : array, shape ()
-    operators : array, shape (jumps, N, N)
+    operators : function from a fraction of the step to the jump operators, shape (jumps, N, N)
     rates : function from a fraction of the step to the rates, shape (jumps,)
     propagators : dict from (start, end), as fractions of the step, to arrays, shape (N, N)
         W between these times.
@@ -143,7 +143,7 @@ class _Channel(NamedTuple):
     structure: mf.DensityMatrices
     order: int
     h: jax.Array
-    operators: np.ndarray
+    operators: Callable
     rates: Callable
     propagators: dict
 
@@ -158,14 +158,18 @@ class _Channel(NamedTuple):
             frozen = {c: _quantum_body(body.at_time(system.span.clip(time + c * h))) for c in fractions}
         assert body.dissipation is not None
         terms = [term for term in body.dissipation.terms if isinstance(term, LindbladJumps)]
-        operators = np.concatenate([term.stacked_operators() for term in terms])
-        losses = adjoint(operators) @ operators
+
+        def operators(c) -> np.ndarray | jax.Array:
+            parts = [term.operators_at(frozen[c].time) for term in terms]
+            has_constants = all(isinstance(part, np.ndarray) for part in parts)
+            return np.concatenate(parts) if has_constants else jnp.concatenate(parts)
 
         def rates(c) -> jax.Array:
             return jnp.concatenate([term.rates_at(frozen[c].time) for term in terms])
 
         def decay_generator(c) -> jax.Array:
             H = structure.matrix(frozen[c].energy.gradient(jnp.zeros(body.dim))[: structure.dim])
+            losses = adjoint(operators(c)) @ operators(c)
             return -1j * H - 0.5 * jnp.tensordot(rates(c), jnp.asarray(losses), 1)
 
         intervals = [(0.0, 1.0)] if order == 2 else [(0.0, 0.25), (0.25, 0.5), (0.0, 0.5), (0.5, 1.0), (0.0, 1.0)]
@@ -214,7 +218,7 @@ class _Channel(NamedTuple):
 
     def _gain(self, c: float, rho) -> jax.Array:
         """Return ``sum rate V rho V^H`` at a fraction of the step."""
-        V = self.operators
+        V = self.operators(c)
         return jnp.sum(self.rates(c)[:, None, None] * (V @ rho @ adjoint(V)), axis=0)
 
 

@@ -117,7 +117,8 @@ def project_onto_levels(
     then wander, and miss all levels by rounding of one sign. So the amount by which a function rises or falls is left
     open there: it changes as the others determine, or not at all if that change has the wrong sign.
     """
-    discrete_gradient, surface, work_direction = CHANGE_GRADIENT, system.surface, system.work_direction
+    discrete_gradient, surface, clock = CHANGE_GRADIENT, system.surface, system.clock
+    work_direction = None if clock is None else clock.work_direction(system.dim)
     signs = jnp.asarray([law.sign for law in laws])
     functions, blocks = [law.function for law in laws], system.state_blocks
 

@@ -33,7 +33,7 @@ class MetriplecticMidpoint(TransportingMethod):
 
     On a manifold the scheme runs in the arrays around it. With ``retraction`` it is
     ``R_h^-1(x, x') = Pi(z) dgrad H + K_d(z) dS(z)`` with the discrete gradient (4.9)-(4.10), in the chart around z [BFM
-    §4.4]: see :class:`InCharts`.
+    §4.4]. It preserves what the method preserves in R^n, and stays on the manifold to rounding.
 
     Parameters
     ----------

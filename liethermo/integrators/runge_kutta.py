@@ -13,6 +13,7 @@ import manifolds as mf
 from ..errors import InputError
 from ..functions.frames import vector_with_inner_products
 from ..systems import System
+from ..systems.clock import error_of_step
 from .base import register
 from .explicit import ExplicitMethod, StepRow, UncorrectedStep
 from .lobatto import LOBATTO_ORDERS, ErrorEstimate, ExplicitTableau, lobatto_tableau
@@ -68,7 +69,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
     for its corrections ends the run with a status.
 
     On a manifold the scheme runs in the arrays around it. With ``retraction`` it runs in the chart ``v -> R(x, v)``
-    around the state, a new chart in each step, with the same order and laws. See :class:`InCharts`.
+    around the state, a new chart in each step, with the same order and laws.
 
     Parameters
     ----------
@@ -176,7 +177,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
         t, step_length = self.tableau, h * jnp.max(jnp.abs(k[StepRow.MEAN_SLOPE]))
 
         def estimated_error(estimate: ErrorEstimate, row: int) -> jax.Array:
-            error_size = h * jnp.max(jnp.abs(system.error_of_step(x, k[row], k[StepRow.MEAN_SLOPE])))
+            error_size = h * jnp.max(jnp.abs(error_of_step(system, x, k[row], k[StepRow.MEAN_SLOPE])))
             ratio = error_size / jnp.where(step_length > 0.0, step_length, 1.0)
             return estimate.scale * step_length * ratio ** (self.order / estimate.order)
 

@@ -13,6 +13,7 @@ import manifolds as mf
 
 from ..errors import InputError
 from ..systems import System
+from ..systems.clock import error_of_step
 from ..tracing.taylor import TaylorSeriesError, check_taylor_series, increment_taylor_coefficients
 from .base import OneStepMethod, register
 from .charts import resolve_retraction
@@ -165,7 +166,7 @@ class MetriplecticTaylor(ExplicitMethod):
         The first term left out of X' is p + 1 times that of X, so the estimate is right to a factor that tends to 1. It
         also detects a condition (``jnp.where``) whose value has changed inside the step.
         """
-        return h * jnp.max(jnp.abs(system.error_of_step(x, k[StepRow.ERROR], k[StepRow.MEAN_SLOPE])))
+        return h * jnp.max(jnp.abs(error_of_step(system, x, k[StepRow.ERROR], k[StepRow.MEAN_SLOPE])))
 
 
 register(*map(MetriplecticTaylor, (6, 12, 20)))

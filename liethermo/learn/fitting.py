@@ -18,6 +18,7 @@ from manifolds.errors import ManifoldsError, warn
 from ..errors import InputError, LiethermoError
 from ..integrators import MetriplecticRungeKutta, OneStepMethod
 from ..systems import System
+from ..units import quantity_in_si
 from . import losses
 from .data import (
     Trajectory,
@@ -61,7 +62,7 @@ def fit(
     window: int = 4,
     substeps: int | None = None,
     method: OneStepMethod | None = None,
-    noise: float | Sequence[float] | None = None,
+    noise: float | str | Sequence[float | str] | None = None,
     observed: Sequence[int] | None = None,
     observe: Callable | None = None,
     validation: float | None = None,
@@ -116,9 +117,10 @@ def fit(
         Steps of a run between two times of the data. By default one; with least squares only, as many as needed.
     method : OneStepMethod
         The method of the runs; by default ``MetriplecticRungeKutta(4)``, with one correction a step.
-    noise : float, or array, shape (n,), optional
+    noise : float, str, or sequence of them, length n, optional
         Standard deviation of the errors of the data, one number or one for each number observed, in the units of the
-        system: in SI units for a table with units. Splines then smooth the data, losses are relative to it, and the fit
+        system: in SI units for a table with units. A text has a unit of its own: ``noise="0.5 deg/s"`` is 0.00873
+        rad/s. Splines then smooth the data, losses are relative to it, and the fit
         also finds the initial states of the short runs. By default it is estimated from the data, by differences that a
         motion does not have; errors below a thousandth of the spread of the data are left out of account. Least squares
         only take it from the residuals, where the differences do not show it. 0 says that the data are exact.
@@ -452,10 +454,17 @@ def _is_real_number(value: Any) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
-def checked_noise(noise: float | Sequence[float] | None, count: int) -> np.ndarray | None:
-    """Return standard deviations of the errors of data, shape (count,); None if ``noise`` is None or 0."""
+def checked_noise(noise: float | str | Sequence[float | str] | None, count: int) -> np.ndarray | None:
+    """Return standard deviations of the errors of data, shape (count,); None if ``noise`` is None or 0.
+
+    Texts such as ``"0.5 deg/s"`` are converted to SI units.
+    """
     if noise is None:
         return None
+    if isinstance(noise, str):
+        noise = quantity_in_si(noise)
+    elif isinstance(noise, Sequence):
+        noise = [quantity_in_si(value) if isinstance(value, str) else value for value in noise]
     try:
         sigma = np.asarray(noise, dtype=np.float64)
     except (TypeError, ValueError):

@@ -12,7 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from ..errors import InputError
-from ..functions.time_span import declared_breaks
+from ..functions.time_span import DeclaredTimes
 from ..integrators import MetriplecticRungeKutta, OneStepMethod, WithAttitude
 from ..runs.flow import differentiable_step, initial_carry
 from ..runs.preparation import prepare_for_method
@@ -238,7 +238,7 @@ def differentiable_stepper(
     InputError
         If functions of time of the system jump: the steps end at the times of the data.
     """
-    if breaks := declared_breaks(system):
+    if breaks := DeclaredTimes.from_tree(system).jumps:
         raise InputError(
             f"the system has functions of time that jump, at t = {breaks[0]:g} and other times, where the steps of a "
             "fit do not end. Use functions of time that are continuous"

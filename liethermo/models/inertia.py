@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._arrays import is_traced
+from manifolds._arrays import host_array, is_traced, real_array
 from manifolds.errors import warn
 
 from ..errors import InputError
@@ -238,15 +238,15 @@ def inverse_inertia(inertia) -> jax.Array:
 
     About the axis of a slender rod, where the moment is zero, the inverse is zero: the rod does not turn about it.
     """
-    inertia = jnp.asarray(inertia)
+    inertia = host_array(real_array(inertia))
     if inertia.ndim == 1:
-        is_zero = inertia == 0.0
-        return jnp.where(is_zero, 0.0, 1.0 / jnp.where(is_zero, 1.0, inertia))
+        xp, is_zero = jnp if is_traced(inertia) else np, inertia == 0.0
+        return real_array(xp.where(is_zero, 0.0, 1.0 / xp.where(is_zero, 1.0, inertia)))
     if not is_traced(inertia):
         moments, axes = np.linalg.eigh(np.asarray(inertia))
         if is_rod(moments):
             inverse_moments = np.append(0.0, 1.0 / moments[1:])
-            return jnp.asarray(axes * inverse_moments @ axes.T)
+            return real_array(axes * inverse_moments @ axes.T)
     inverse = jnp.linalg.inv(inertia)
     return 0.5 * (inverse + inverse.T)
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 import manifolds as mf
+from manifolds._arrays import host_array
 
 from ..dissipation.checks import checked_rate
 from ..dissipation.inner_product import KillingDissipation
@@ -60,7 +61,7 @@ def rigid_body(
         mf.so(3),
         energy=Quadratic(inverse_inertia(checked_inertia(inertia, allow_rod=True))),
         entropy=Quadratic(np.ones(3)),
-        dissipation=KillingDissipation(0.5 * checked_rate(rate)),
+        dissipation=KillingDissipation(0.5 * host_array(checked_rate(rate))),
         group=mf.SO(3) if attitude else None,
         torque=torque,
     )

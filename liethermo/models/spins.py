@@ -17,8 +17,9 @@ from ..systems import HeatBaths, SpinSystem
 def single_spin(field=1.0, rate=0.1, baths: HeatBaths | None = None) -> SpinSystem:
     """A spin in a field B along the third axis, ``H = -B s_3``; damping turns it towards the field.
 
-    With |s| = 1 the motion is known: see :func:`single_spin_solution`. Switching from one polar angle to another takes
-    the time ``log(s' / s) / (rate B)``, s the tangents of the half angles.
+    With |s| = 1 the motion is known: ``s_3 = tanh(rate B t + artanh s_3(0))``, and the rest turns by the angle ``B t``
+    [Landau & Lifshitz 1935]. Switching from one polar angle to another takes the time ``log(s' / s) / (rate B)``, s the
+    tangents of the half angles.
 
     Parameters
     ----------
@@ -30,22 +31,6 @@ def single_spin(field=1.0, rate=0.1, baths: HeatBaths | None = None) -> SpinSyst
         Baths that absorb the heat; without them the energy falls.
     """
     return SpinSystem(1, zeeman(1, _third_axis_vector(field)), LandauLifshitz(rate), baths)
-
-
-def single_spin_solution(t, start, field: float = 1.0, rate: float = 0.1) -> np.ndarray:
-    """Return the exact spin at some times, shape (..., 3), from a unit vector at t = 0.
-
-    ``s_3 = tanh(rate B t + artanh s_3(0))``, and the rest turns by the angle ``B t`` [Landau & Lifshitz 1935].
-    """
-    t, s = np.asarray(t, dtype=float), np.asarray(start, dtype=float)
-    growth = rate * field * t
-    # addition theorems of tanh and sech avoid artanh(s_3(0)), which overflows if s_3(0) rounds to 1
-    third = (np.sinh(growth) + s[2] * np.cosh(growth)) / (np.cosh(growth) + s[2] * np.sinh(growth))
-    transverse_factor = 1.0 / (np.cosh(growth) + s[2] * np.sinh(growth))
-    c, d = np.cos(field * t), np.sin(field * t)
-    return np.stack(
-        [transverse_factor * (c * s[0] - d * s[1]), transverse_factor * (d * s[0] + c * s[1]), third], axis=-1
-    )
 
 
 def spin_lattice(
@@ -98,14 +83,6 @@ def spin_lattice(
         raise InputError(f"baths must be lt.HeatBaths, True for one as large as the lattice, or False, got {baths!r}")
     lattice_baths = HeatBaths(capacity=float(np.prod(shape))) if baths is True else baths or None
     return SpinSystem(shape, Sum(tuple(terms)), LandauLifshitz(rate, bath), lattice_baths)
-
-
-def spin_wave_frequency(wave_number, exchange_constant: float = 1.0, anisotropy_constant: float = 0.0, field=0.0):
-    """Return the frequency of a small wave on a ring of spins along the third axis, ``2 J (1 - cos q) + 2 K + B``.
-
-    The wave number q is an angle per site.
-    """
-    return 2.0 * exchange_constant * (1.0 - np.cos(wave_number)) + 2.0 * anisotropy_constant + field
 
 
 def _third_axis_vector(field):

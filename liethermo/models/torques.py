@@ -23,7 +23,8 @@ from manifolds._pytree_module import Module
 from ..errors import InputError
 from ..functions.conditions import checked_numbers, require_condition
 from ..functions.piecewise import PiecewiseConstant as FunctionPiecewiseConstant
-from ..functions.piecewise import Table, TableKind
+from ..functions.piecewise import Table, TableKind, kinks_of_table
+from ..functions.time_span import FunctionWithBreaks
 from .inertia import checked_inertia
 from .orbits import DipoleField, Orbit, checked_eccentricity, checked_perpendicular, direction_and_distance, unit_vector
 from .parameters import checked_finite, checked_positive
@@ -441,11 +442,12 @@ class PiecewiseConstant(Module):
         return self.torque(t)
 
 
-class Tabulated(Module):
+class Tabulated(FunctionWithBreaks):
     """A torque in body axes from a table, linear or cubic in t between its times and zero outside.
 
-    A step across a time of a linear table has an error of second order there, whatever the method: let steps end at
-    these times by ``breaks=``. The laws hold all the same. See :class:`Table`.
+    Steps end at the times of a linear table by themselves, unless it has more than 1,000 of them in the span of the run
+    or more than the run has steps of a given size. A step across such a time has an error of second order there,
+    whatever the method, but the laws hold all the same. See :class:`Table`.
 
     Parameters
     ----------
@@ -466,6 +468,10 @@ class Tabulated(Module):
             raise InputError("a table needs times and moments, or a spline of SciPy alone")
         table = Table(times, moments, kind, name="moments")
         self.times, self.moments, self.coefficients = table.times, table.values, table.coefficients
+
+    @property
+    def kink_times(self) -> tuple[float, ...]:
+        return kinks_of_table(self.times, self.moments is None)
 
     def __call__(self, t, mu):
         return Table.from_parts(self.times, self.moments, self.coefficients)(t)

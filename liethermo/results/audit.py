@@ -309,7 +309,7 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
         rows.append(_judged_row("attitude in group", stats.attitude_residual, tolerances.attitude))
     if stats.spatial_momentum_change is not None:
         rows.append(_spatial_momentum_row(stats.spatial_momentum_change, laws, tolerances))
-    rows += [AuditRow(c.name, c.value, c.limit, c.holds, c.note, c.concerns_model) for c in evidence.conditions]
+    rows += condition_rows(evidence)
     rows += _accuracy_and_consistency_rows(evidence, tolerances)
     status = solution.status  # a run stopped by its user is short, but breaks no law
     has_failed = not status.ok and status.code != StatusCode.INTERRUPTED.status_name
@@ -387,6 +387,11 @@ def _accuracy_and_consistency_rows(evidence: Evidence, tolerances: Tolerances) -
         note = "" if row.passed else "short steps of this method do not follow the vector field of this system"
         rows.append(replace(row, note=note))
     return rows
+
+
+def condition_rows(evidence: Evidence) -> list[AuditRow]:
+    """Return the rows of the conditions of a run, or of an ensemble, beside its laws."""
+    return [AuditRow(c.name, c.value, c.limit, c.holds, c.note, c.concerns_model) for c in evidence.conditions]
 
 
 def accuracy_row(evidence: Evidence, tolerances: Tolerances) -> AuditRow:

@@ -20,7 +20,7 @@ from ..functions.rounding import value_and_rounding_scale
 from ..integrators import OneStepMethod
 from ..integrators.fluctuating import noise_dimension
 from ..systems import System
-from ..systems.conditions import RunCondition
+from ..systems.conditions import RunCondition, worst_conditions
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.scalarize import UnsupportedPrimitive
 from .netcdf import SaveableResult
@@ -115,16 +115,17 @@ def merge_evidence(evidence_list: Sequence[Evidence]) -> Evidence:
     """Return the joint evidence of several sets of runs: the maximum of each number."""
     names = dict.fromkeys(name for evidence in evidence_list for name in evidence.terms)
     terms = {name: max(evidence.terms.get(name, 0.0) for evidence in evidence_list) for name in names}
+    conditions = worst_conditions(evidence.conditions for evidence in evidence_list)
     with_error = [evidence for evidence in evidence_list if evidence.local_error is not None]
     if not with_error:
-        return Evidence(terms=terms)
+        return Evidence(terms=terms, conditions=conditions)
     errors = [
         np.inf if evidence.local_error is None else np.nan_to_num(evidence.local_error, nan=np.inf)
         for evidence in with_error
     ]
     worst = with_error[int(np.argmax(errors))]
     n_checked = sum(evidence.looked or 0 for evidence in with_error)
-    return dataclasses.replace(worst, terms=terms, looked=n_checked)
+    return dataclasses.replace(worst, terms=terms, looked=n_checked, conditions=conditions)
 
 
 VELOCITY_AXES = {"angular_velocity": "axis", "joint_rates": "joint_coordinate"}

@@ -15,7 +15,7 @@ from manifolds._tables import html_grid
 
 from ..engines.status_codes import STATUS_NAMES, StatusCode
 from ..errors import InputError
-from .audit import FAILED_TRAJECTORIES_ROW, Audit, AuditRow, Tolerances, accuracy_row, coverage_text
+from .audit import FAILED_TRAJECTORIES_ROW, Audit, AuditRow, Tolerances, accuracy_row, condition_rows, coverage_text
 from .audit_evidence import VELOCITY_AXES, AuditableResult, Evidence, copies_of_velocities, merge_evidence
 from .ensemble_laws import evaluate_ensemble_laws
 from .events import Events
@@ -307,7 +307,9 @@ class Ensemble(AuditableResult):
         """Audit the laws at every step of every trajectory; each row shows the worst trajectory.
 
         Local errors are measured along at most 32 trajectories, from their start as far as is affordable; with adaptive
-        steps, in the first step. If not all steps were checked, the verdict says how many.
+        steps, in the first step. Conditions beside the laws, such as the positivity of density matrices, are evaluated
+        at the saved states of the same trajectories, or at their ends if only these are kept. If not all steps were
+        checked, the verdict says how many.
 
         Parameters
         ----------
@@ -325,6 +327,7 @@ class Ensemble(AuditableResult):
         for law in evaluate_ensemble_laws(self, self.laws, limits, terms.get("energy", 0.0), terms.get("entropy", 0.0)):
             i = law.worst_member
             rows.append(law.audit_row(i, f"worst is trajectory {i}"))
+        rows += condition_rows(self.evidence)
         if self.evidence_source is not None or self.evidence.local_error is not None:
             rows.append(accuracy_row(self.evidence, limits))
         n_failed = int((~self.ok & (self.status != StatusCode.INTERRUPTED)).sum())

@@ -14,7 +14,7 @@ from manifolds._precision import with_library_settings
 from ..engines.select_engine import is_worth_compiling, warn_of_fallback
 from ..engines.status_codes import StatusCode
 from ..errors import InputError
-from ..functions.time_span import declared_breaks
+from ..functions.time_span import DeclaredTimes
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..integrators.fluctuating import noise_dimension
 from ..results.ensemble import Ensemble, Subset, join_subsets
@@ -151,8 +151,8 @@ def ensemble(
         )
     family = Family.from_arguments(system, parameters)
     save_every_step = save_every if outputs == "trajectory" and save_at is None else None
-    declared = declared_breaks(family.representative)
-    schedule = make_schedule(t_span, step, save_every_step, save_at, breaks=breaks, declared_breaks=declared)
+    declared = DeclaredTimes.from_tree(family.with_unknown_parameters())
+    schedule = make_schedule(t_span, step, save_every_step, save_at, breaks=breaks, declared=declared)
     attitude = attitude_array(attitude, None)
     states, reasons = _checked_initial_states(family, x0s, len(attitude) if np.ndim(attitude) == 3 else 1)
     check_noise(noise, len(states))

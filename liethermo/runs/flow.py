@@ -31,9 +31,10 @@ from ..engines.step import (
     stage_equations,
 )
 from ..errors import InputError
-from ..functions.time_span import declared_breaks
+from ..functions.time_span import DeclaredTimes
 from ..integrators import DEFAULT_METHOD, OneStepMethod
 from ..systems import System
+from ..systems.clock import system_of_step
 from ..tracing.programs import jit_cached, jit_unoptimised
 from .adaptive import Adaptive
 from .flow_derivatives import state_derivatives
@@ -132,8 +133,8 @@ def flow(
     if save_at is not None and save_every is not None:
         raise InputError("flow takes save_at or save_every, got both. Remove one of them")
     save_every = 1 if save_at is not None else save_every
-    x, declared = system.state(x0), declared_breaks(system)
-    schedule = make_schedule(t_span, step, save_every, breaks=breaks, declared_breaks=declared)
+    x, declared = system.state(x0), DeclaredTimes.from_tree(system)
+    schedule = make_schedule(t_span, step, save_every, breaks=breaks, declared=declared)
     times = None if save_at is None else checked_save_times(save_at, schedule)
     n, user_system = system.dim, system
     system, method = prepare_for_method(system, method, None, attitude is not None)
@@ -322,7 +323,7 @@ def _recompute_path(system: System, method: OneStepMethod, x, step_sizes, steps:
 
         def step(x, solved_step, h=step_sizes[i]):
             _, compensation, k = solved_step
-            step_system = system.system_of_step(x)
+            step_system = system_of_step(system, x)
             k = _implicit_slopes(step_system, method, x, compensation, h, k)
             return method.move(step_system, x, compensation, h, k)[0], None
 
@@ -365,7 +366,7 @@ def differentiable_step(
 ) -> tuple[jax.Array, ...]:
     """Return the carry after a step that JAX can differentiate; NaN if its equations cannot be solved."""
     x, compensation, k, older_k = carry
-    system = system.system_of_step(x)
+    system = system_of_step(system, x)
     if method.explicit:
         new_k = _slopes_or_nan(explicit_stage_solution(system, method, x, compensation, h, k))
     else:

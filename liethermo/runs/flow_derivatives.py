@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from ..systems.clock import system_of_step
 from ..tracing.interpret import evaluate_at_points
 
 MAX_VALUES_PER_CALL = 1_000_000
@@ -66,7 +67,7 @@ class _StepFunction(eqx.Module):
             for leaf, is_parameter in zip(other_leaves, self.is_differentiated[:-1], strict=True)
         ]
         system, method, _ = jax.tree_util.tree_unflatten(structure, [*other_leaves, x])
-        return system.system_of_step(z[:n]), method, z[:n], z[len(z) - m :].reshape(self.slopes_shape)
+        return system_of_step(system, z[:n]), method, z[:n], z[len(z) - m :].reshape(self.slopes_shape)
 
     def __call__(self, h, compensation, z) -> jax.Array:
         """Return the residual of the stage equations, followed by the next state."""

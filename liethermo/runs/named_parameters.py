@@ -66,7 +66,8 @@ def replace_parameters(system: System, values: Mapping[str, Any]) -> System:
     InputError
         If the system has no parameter of a name, or a value has another shape.
     """
-    leaves: list[Any] = list(parameter_arrays(system))
+    # the system's own arrays, which cannot change in place, so that results for the new system can be cached
+    leaves: list[Any] = jax.tree_util.tree_leaves(eqx.filter(system, eqx.is_inexact_array))
     replaced: dict[int, str] = {}
     for name, value in values.items():
         parameter = find_parameter(system, name)

@@ -28,6 +28,7 @@ from ..systems import (
     make_autonomous,
 )
 from ..systems.attitude import driven_system_or_none
+from ..systems.clock import WORK_NAME
 from ..systems.invariants import recorded_invariants, resolve_invariants_near, undecided_functions
 from ..tracing.caching import LRUCache, memoize
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
@@ -244,6 +245,7 @@ def promised_laws(system: System, method, invariants) -> Laws:
     unknown = tuple(name for name, (_, is_conserved) in invariants.items() if is_conserved is None)
     conserved_names = tuple(name for name in constants if method_preserves(system, name))
     unpromised_names = tuple(name for name in constants if name not in conserved_names)
+    balance_entries = () if system.clock is None else (WORK_NAME,)
     if isinstance(method, OneStepMethod) and noise_dimension(method):  # what holds on paths, and what in the mean
         energy = "conserved" if system.energy_law == "conserved" else None
         laws_in_mean = ("energy", "entropy") if energy is None else ("entropy",)
@@ -253,7 +255,7 @@ def promised_laws(system: System, method, invariants) -> Laws:
             conserved_names,
             tuple(system.ledger),
             (),
-            system.balance_entries,
+            balance_entries,
             unpromised_names,
             laws_in_mean,
             unknown,
@@ -263,4 +265,4 @@ def promised_laws(system: System, method, invariants) -> Laws:
     inexact = tuple(law for law, claims in exact.items() if not claims & method.preserves)
     ledger = tuple(system.ledger)
     law_names = system.energy_law, system.entropy_law
-    return Laws(*law_names, conserved_names, ledger, inexact, system.balance_entries, unpromised_names, unknown=unknown)
+    return Laws(*law_names, conserved_names, ledger, inexact, balance_entries, unpromised_names, unknown=unknown)

@@ -15,7 +15,7 @@ from manifolds._precision import with_library_settings
 from ..engines.select_engine import ENGINES
 from ..engines.status_codes import StatusCode
 from ..errors import ConvergenceError, FileError, InputError, NonFiniteError
-from ..functions.time_span import declared_breaks
+from ..functions.time_span import TIMES_OF_SMOOTH_FUNCTIONS, DeclaredTimes
 from ..integrators import DEFAULT_METHOD, OneStepMethod, Reference
 from ..results.ensemble import Ensemble
 from ..results.solution import Solution
@@ -188,7 +188,7 @@ class Propagator:
             raise InputError(REFERENCE_STEPS)
         if self.noise is not None and (dense or until is not None):
             raise InputError(NOISY_STEPS)
-        declared = self._declared_breaks if problem.is_driven else ()
+        declared = self._declared_times if problem.is_driven else TIMES_OF_SMOOTH_FUNCTIONS
         allow_infinite_end = adaptive and until is not None
         schedule = self._schedule(t_span, save_every, save_at, allow_infinite_end, breaks, declared)
         x = problem.initial_state(x0, schedule.start, attitude)
@@ -199,7 +199,7 @@ class Propagator:
             if isinstance(self.method, Reference):
                 run.run_with_scipy(bar)
             elif adaptive or until is not None:
-                run.run_with_step_control(bar, step if adaptive else schedule.h, until)
+                run.run_adaptive_or_until_event(bar, step if adaptive else schedule.h, until)
             else:
                 run.run_fixed(bar)
         solution = run.solution()
@@ -295,15 +295,15 @@ class Propagator:
         return problem
 
     @functools.cached_property
-    def _declared_breaks(self) -> tuple[float, ...]:
-        """Times at which functions of time of the system say that they jump."""
-        return declared_breaks(self.system)
+    def _declared_times(self) -> DeclaredTimes:
+        """Times at which functions of time of the system say that they are not smooth."""
+        return DeclaredTimes.from_tree(self.system)
 
     def _schedule(
-        self, t_span, save_every: int, save_at, allow_infinite_end: bool, breaks, declared: tuple[float, ...]
+        self, t_span, save_every: int, save_at, allow_infinite_end: bool, breaks, declared: DeclaredTimes
     ) -> StepSchedule:
         """Return the schedule of a run; short ones that were used last are held in memory."""
-        if save_at is not None or allow_infinite_end or np.size(breaks) or declared or type(save_every) is not int:
+        if save_at is not None or allow_infinite_end or np.size(breaks) or any(declared) or type(save_every) is not int:
             return make_schedule(t_span, self.step, save_every, save_at, allow_infinite_end, breaks, declared)
         key = *checked_span(t_span), save_every
         schedule = self._schedules.get(key)

@@ -18,11 +18,13 @@ from ..integrators import OneStepMethod
 from ..results.audit import RoundingScale
 from ..results.audit_evidence import (
     MAX_LOCAL_ERROR_STEPS,
+    MAX_SENSITIVITY_STATES,
     MIN_MOTION_FRACTION,
     MIN_RELATIVE_MOTION,
     SMALLEST_NORMAL,
     Evidence,
     energy_and_entropy,
+    evenly_spaced_indices,
     largest_and_evenly_spaced,
     n_replayed_steps,
     rounding_scales,
@@ -33,6 +35,7 @@ from ..results.solution import Solution
 from ..results.step_sampling import MAX_SAMPLED_VALUES, REPLAY_COST_RATIO, StepSample
 from ..systems import AttitudeSystem, System
 from ..systems.attitude import driven_system_or_none
+from ..systems.conditions import RunCondition, worst_conditions
 from ..systems.states import reshape_to_sites
 from ..tracing.interpret import evaluate_at_points
 from .preparation import invariants_and_laws
@@ -320,13 +323,14 @@ class EnsembleEvidenceCollector:
         self.x, self.distance = np.ascontiguousarray(record.x0[sample]), record.quantities["distance"][sample]
         self.h, self.start_time, self.replay = record.quantities["first_step"][sample], record.schedule.start, replay
         self.n_steps_taken = record.steps[sample]
+        self.saved_states, self.saved_times = _states_for_conditions(record, sample)
         self.max_replayed_steps = max(1, min(n_equal_steps, MAX_SAMPLED_VALUES // (REPLAY_COST_RATIO * self.x.size)))
 
     @np.errstate(over="ignore", invalid="ignore")  # overflowed states have the status non_finite
     def __call__(self) -> Evidence:
         form, n_members = self.family.form, len(self.x)
         parameters = self.family.parameter_matrix(slice(None), n_members)
-        evidence = Evidence(terms=self._rounding_scales(parameters))
+        evidence = Evidence(terms=self._rounding_scales(parameters), conditions=self._conditions())
         final, states = self.replay(self.family, self.method, self.x, self.h, self.max_replayed_steps)
         member_of_step, step_number = np.nonzero(
             np.arange(self.max_replayed_steps) < np.fmin(final["step"], self.n_steps_taken)[:, None]
@@ -378,6 +382,15 @@ class EnsembleEvidenceCollector:
             looked=len(steps.h),
         )
 
+    def _conditions(self) -> tuple[RunCondition, ...]:
+        """Return the conditions beside the laws, each of the trajectory of the sample where it is worst."""
+        guarantees = frozenset(self.method.preserves)
+        known_states = (states[np.isfinite(states).all(axis=1)] for states in self.saved_states)
+        return worst_conditions(
+            self.family.member(i).run_conditions(states, self.saved_times, guarantees)
+            for i, states in enumerate(known_states)
+        )
+
     def _rounding_scales(self, parameters: np.ndarray) -> dict[str, float]:
         """Return the scales at which energy and entropy are rounded, each the largest of the sample."""
         rows = np.concatenate([parameters, self.x], axis=1)
@@ -388,6 +401,17 @@ class EnsembleEvidenceCollector:
 
     def _user_states(self, x: np.ndarray) -> np.ndarray:
         return np.asarray(self.member.points(x)).reshape(len(x), -1)
+
+
+def _states_for_conditions(record: EnsembleRecord, sample: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return saved states of some trajectories, shape (sample, times, n), and times that are spread over the run."""
+    if record.trajectories is None:
+        assert record.x is not None
+        states = np.stack([record.x0[sample], record.x[sample]], axis=1)
+        end = np.nanmax(record.quantities["end_time"])
+        return states, np.linspace(record.schedule.start, end, MAX_SENSITIVITY_STATES)
+    times = evenly_spaced_indices(record.trajectories.shape[1], MAX_SENSITIVITY_STATES)
+    return record.trajectories[sample][:, times, :-2], record.saved_times[times]
 
 
 def _rounding_scales_at(model: tuple[ProgramStructure, int], row):

@@ -139,7 +139,7 @@ class Run:
             StatusCode.COMPLETED, f"reached t = {self.schedule.end:g} in 0 steps", 0, self.schedule.end
         )
 
-    def run_with_step_control(self, bar, step: float | Adaptive, until) -> None:
+    def run_adaptive_or_until_event(self, bar, step: float | Adaptive, until) -> None:
         """Take adaptive steps, or steps of a given size with events; every step is examined."""
         start, end, save_every = self.schedule.start, self.schedule.end, self.schedule.save_every or 1
         saves_at_stops, stops = self.schedule.save_every is None, self.schedule.stop_times
@@ -245,13 +245,14 @@ class Run:
         """Return what :meth:`liethermo.Reference.trajectory` returns; the solver starts again at each break."""
         break_indices = np.searchsorted(times, self.schedule.breaks)
         x, n_evaluations, energy = np.array(self.saved_states[0]), 0, self.saved_energies_entropies[0][0, 0]
+        clock = self.system.clock
         for first, last in itertools.pairwise([0, *break_indices.tolist(), len(times) - 1]):
             system, x[-1] = start_step(self.system, jnp.asarray(x[-1]), energy)
             states, n, message, was_interrupted = self.method.trajectory(system, x[-1], times[first : last + 1])
             x, n_evaluations = np.concatenate([x, states[1:]]), n_evaluations + n
             if message or was_interrupted or len(states) <= last - first:
                 break
-            energy = system.energy.value(x[-1]) if self.system.energy_jumps else energy
+            energy = system.energy.value(x[-1]) if clock is not None and clock.energy_jumps else energy
         return x, n_evaluations, message, was_interrupted
 
     def _energies_and_entropies(self, x: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 from ..engines.array_engine import MAX_SAVES_PER_CALL
 from ..errors import InputError
 from ..functions.gradients import EPS
-from ..functions.time_span import checked_breaks
+from ..functions.time_span import TIMES_OF_SMOOTH_FUNCTIONS, DeclaredTimes, checked_breaks
 from .adaptive import Adaptive
 
 CHUNK_STEPS = 100_000
@@ -264,6 +264,13 @@ class StepSchedule:
         )
 
 
+MAX_KINKS = 1000
+"""Largest number of declared kinks in a span at which steps end.
+
+A run that ends 1,000 steps at such times takes 0.7 s, one with 3,000 of them 8.6 s, since each step looks for its
+interval among all (order 8 at a tolerance of 1e-9)."""
+
+
 def make_schedule(
     span,
     step: float | Adaptive,
@@ -271,16 +278,22 @@ def make_schedule(
     save_at=None,
     allow_infinite_end: bool = False,
     breaks: Sequence[float] = (),
-    declared_breaks: Sequence[float] = (),
+    declared: DeclaredTimes = TIMES_OF_SMOOTH_FUNCTIONS,
 ) -> StepSchedule:
     """Return the schedule of a run; an adaptive run has one nominal step, as long as the span.
 
     With ``save_at`` the steps end at these times, and only the states there are saved. Steps end at the user's
-    ``breaks`` and at those that the system declares, as far as they lie inside the span.
+    ``breaks``, at the jumps that the system declares and at its kinks, as far as they lie inside the span. Kinks are
+    left out where there are more than MAX_KINKS of them, more than steps of a given size, or where they would change
+    which states ``save_every`` saves.
     """
     start, end = checked_span(span, allow_infinite_end)
     step_size = end - start if isinstance(step, Adaptive) else step
-    all_breaks = {*(checked_breaks(breaks) if np.size(breaks) else ()), *declared_breaks}
+    kinks = [t for t in declared.kinks if start < t < end]
+    if not isinstance(step, Adaptive) and (save_every not in (None, 1) or len(kinks) * step > end - start):
+        kinks = []
+    kinks = kinks if len(kinks) <= MAX_KINKS else []
+    all_breaks = {*(checked_breaks(breaks) if np.size(breaks) else ()), *declared.jumps, *kinks}
     breaks_inside = tuple(sorted(t for t in all_breaks if start < t < end))
     schedule = StepSchedule(
         (start, end), step_size, save_every, allow_infinite_end=allow_infinite_end, breaks=breaks_inside

@@ -226,6 +226,11 @@ class Family:
         """The member that is reported for all: the example if there is one, otherwise the first."""
         return self.member(0) if self.example is None else self.example
 
+    def with_unknown_parameters(self) -> System:
+        """Return a member whose parameters are NaN where those of the members differ."""
+        arrays = zip(self.parameter_arrays, self.has_member_axis, strict=True)
+        return self.form.rebuild([np.full(a.shape[1:], np.nan) if differ else a[0] for a, differ in arrays])
+
     def members_with_extreme_parameters(self) -> list[int]:
         """Return members with the smallest and largest parameters, which are the likeliest to be out of range."""
         indices = {0: None}

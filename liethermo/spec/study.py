@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,6 @@ from ..runs.events import Relaxed
 from ..studies.axes import Zipped, latin_hypercube, sobol, zipped
 from ..studies.measures import At
 from ..studies.study import Study
-from ..systems import System
 from .messages import format_value, suggest_match
 from .reading import Spec
 from .schema import EvenlySpacedAxis, MeasureTable, SampledAxis
@@ -27,32 +26,23 @@ INITIAL_STATE_KEY = "initial"
 
 
 @dataclass(frozen=True)
-class SystemBuilder:
-    """Picklable function from the parameters of a point to the system of a spec file."""
+class PointBuilder:
+    """Picklable function of the parameters of a point: it calls ``build`` with a table in which these are set."""
 
-    build: Callable[..., System]
-    parameters: Mapping[str, Any]
+    build: Callable[..., Any]
+    table: Mapping[str, Any]
     varied_names: tuple[str, ...]
 
-    def __call__(self, point: Mapping[str, Any]) -> System:
-        parameters = copy.deepcopy(dict(self.parameters))
-        for name in self.varied_names:
-            _set_entry(parameters, name, point[name])
-        return self.build(**parameters)
-
-
-@dataclass(frozen=True)
-class InitialStateBuilder:
-    """Picklable function from the parameters of a point to its initial state, shape (n,)."""
-
-    initial: tuple[float, ...]
-    varied_names: tuple[str, ...]
-
-    def __call__(self, point: Mapping[str, Any]):
-        table = {INITIAL_STATE_KEY: list(self.initial)}
+    def __call__(self, point: Mapping[str, Any]) -> Any:
+        table = copy.deepcopy(dict(self.table))
         for name in self.varied_names:
             _set_entry(table, name, point[name])
-        return jnp.stack([jnp.asarray(value, dtype=jnp.float64) for value in table[INITIAL_STATE_KEY]])
+        return self.build(**table)
+
+
+def _initial_state(initial: Sequence[Any]) -> jnp.ndarray:
+    """Return the initial state, shape (n,), some of whose entries may be traced."""
+    return jnp.stack([jnp.asarray(value, dtype=jnp.float64) for value in initial])
 
 
 def _set_entry(table: dict[str, Any], name: str, value: Any) -> None:
@@ -101,16 +91,18 @@ def build_study(spec: Spec, store: str | os.PathLike) -> Study:
     parameter_names, state_names = (
         [n for n in names if (_parse_entry_name(n)[0] == INITIAL_STATE_KEY) == initial] for initial in (False, True)
     )
-    initial = tuple(spec.run.initial)
+    initial = list(spec.run.initial)
     entries = {
         _parse_entry_name(name)[0] for name in parameter_names if "[" in name
     }  # defaults of the model that only an axis mentions
     parameters = {**{name: spec.model_arguments[name] for name in entries}, **spec.parameters}
     try:
         return Study(
-            SystemBuilder(spec.build, parameters, tuple(parameter_names)),
+            PointBuilder(spec.build, parameters, tuple(parameter_names)),
             axes,
-            x0=InitialStateBuilder(initial, tuple(state_names)) if state_names else np.array(initial),
+            x0=PointBuilder(_initial_state, {INITIAL_STATE_KEY: initial}, tuple(state_names))
+            if state_names
+            else np.array(initial),
             t_span=spec.run.t_span,
             step=spec.step,
             method=spec.method,

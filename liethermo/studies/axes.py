@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -325,3 +326,46 @@ class Axes:
             for axis, i in zip(self.axes, index, strict=True)
             for name, column in (axis.columns or {axis.name: axis.labels}).items()
         )
+
+
+def axes_in_store_order(study_axes: Axes, stored_axes: Axes) -> Axes:
+    """Return the study's axes in the order of a store: first the values that it has, then the new ones.
+
+    Raises
+    ------
+    InputError
+        If the axes have other names, or lack values that the store has.
+    """
+    if study_axes.names != stored_axes.names or [tuple(a.columns) for a in study_axes.axes] != [
+        tuple(a.columns) for a in stored_axes.axes
+    ]:
+        names = [
+            ", ".join(f"{a.name} ({', '.join(a.columns)})" for a in axes.axes) for axes in (study_axes, stored_axes)
+        ]
+        raise InputError(f"the axes are {names[0]}, but those of the store {names[1]}")
+    matched_axes = []
+    for axis, stored_axis in zip(study_axes.axes, stored_axes.axes, strict=True):
+        if axis.has_same_values(stored_axis):  # skip the search, which takes microseconds per value
+            matched_axes.append(axis)
+            continue
+        unmatched_indices: dict[Any, list[int]] = {}
+        for i, row in enumerate(axis.value_keys()):
+            unmatched_indices.setdefault(row, []).append(i)
+        for i, row in enumerate(stored_axis.value_keys()):
+            if not unmatched_indices.get(row):
+                raise InputError(
+                    f"the axis {axis.name!r} lacks {row[0] if len(row) == 1 else row!r}, which is value {i} in the "
+                    "store; an axis can be extended, but must keep its values"
+                )
+            unmatched_indices[row].pop(0)
+        new_indices = sorted(itertools.chain.from_iterable(unmatched_indices.values()))
+        columns = {
+            name: np.append(stored_values, axis.columns[name][new_indices])
+            for name, stored_values in stored_axis.columns.items()
+        }
+        labels = columns.get(axis.name, np.arange(len(stored_axis) + len(new_indices)))
+        states = None
+        if axis.states is not None and stored_axis.states is not None:
+            states = np.concatenate([stored_axis.states, axis.states[new_indices]])
+        matched_axes.append(Axis(axis.name, labels, columns, states))
+    return Axes(tuple(matched_axes))

@@ -1,166 +1,23 @@
-"""Files of a store: Zarr v3 arrays in a folder, with atomic writes and a checksum in every chunk.
-
-The chunks are written here and not by the ``zarr`` package, which is slow for small chunks and reads a missing chunk as
-fill values. The files are plain Zarr v3 with the codecs "bytes" or "vlen-utf8" and "crc32c"; ``zarr`` and ``xarray``
-can read them.
-"""
+"""Plain files of a store: atomic writing, reading without following links, and a lock for one run at a time."""
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
 import json
-import math
 import os
 import shutil
 import socket
 import stat
-import struct
 import tempfile
 import time
 import weakref
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from .. import disk
 from ..errors import FileError
-
-ZARR_DTYPES = ("int8", "int64", "float64", "complex128", "bool", "string")
-"""Zarr data types that a store may contain."""
-
-MAX_CHUNK_VALUES = 2**27
-"""Maximum number of values in a chunk, a limit on the memory that a foreign store can claim."""
-
-
-@dataclass(frozen=True)
-class ZarrArray:
-    """Metadata of one array of a store, with the encoding of its chunks.
-
-    Attributes
-    ----------
-    name : str
-    dims : tuple of str
-    shape, chunks : tuple of int
-    dtype : str
-        A type of Zarr: "int8", "int64", "float64", "complex128", "bool" or "string".
-    attributes : dict
-    """
-
-    name: str
-    dims: tuple[str, ...]
-    shape: tuple[int, ...]
-    chunks: tuple[int, ...]
-    dtype: str
-    attributes: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def fill_value(self) -> Any:
-        """The fill value of missing values, as JSON."""
-        return {"float64": "NaN", "complex128": ["NaN", "NaN"], "int8": -1, "string": "", "bool": False}.get(
-            self.dtype, 0
-        )
-
-    @property
-    def numpy_dtype(self) -> np.dtype:
-        return np.dtype(object if self.dtype == "string" else self.dtype).newbyteorder("<")
-
-    def metadata(self) -> dict[str, Any]:
-        """Return the content of the array's ``zarr.json``."""
-        bytes_codec = {"name": "bytes", "configuration": {"endian": "little"}}
-        return {
-            "zarr_format": 3,
-            "node_type": "array",
-            "shape": list(self.shape),
-            "data_type": self.dtype,
-            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(self.chunks)}},
-            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
-            "fill_value": self.fill_value,
-            "codecs": [{"name": "vlen-utf8"} if self.dtype == "string" else bytes_codec, {"name": "crc32c"}],
-            "attributes": self.attributes,
-            "dimension_names": list(self.dims),
-            "storage_transformers": [],
-        }
-
-    @classmethod
-    def from_metadata(cls, name: str, metadata: dict[str, Any]) -> ZarrArray:
-        """Make an array from its metadata; raise ValueError, KeyError or TypeError if a study cannot have written
-        them."""
-        chunks, attributes = metadata["chunk_grid"]["configuration"]["chunk_shape"], metadata["attributes"]
-        dims, shape, dtype = metadata["dimension_names"], metadata["shape"], metadata["data_type"]
-        lengths = [*shape, *chunks]
-        is_valid_shape = all(type(n) is int and 0 <= n < 2**48 for n in lengths) and all(n > 0 for n in chunks)
-        if not (is_valid_shape and len(shape) == len(chunks) == len(dims) and math.prod(chunks) <= MAX_CHUNK_VALUES):
-            raise ValueError(f"the array {name!r} has shape {shape} in chunks {chunks}")
-        if dtype not in ZARR_DTYPES or not isinstance(attributes, dict) or not all(isinstance(d, str) for d in dims):
-            raise ValueError(f"the array {name!r} is none that a study writes")
-        return cls(name, tuple(dims), tuple(shape), tuple(chunks), dtype, attributes)
-
-    def chunk_path(self, index: Sequence[int]) -> str:
-        """Return the path of a chunk, relative to the store."""
-        return "/".join([self.name, "c", *map(str, index)])
-
-    # -- chunks ---------------------------------------------------------------------------------------------------
-
-    def empty_chunk(self) -> np.ndarray:
-        """Return a chunk of fill values, shape ``chunks``."""
-        if self.dtype == "string":
-            return np.full(self.chunks, "", dtype=object)
-        return np.full(
-            self.chunks, {"int8": -1, "bool": False, "int64": 0}.get(self.dtype, np.nan), dtype=self.numpy_dtype
-        )
-
-    def encode_chunk(self, block: np.ndarray) -> bytes:
-        """Return the bytes of a chunk's file: the encoded values and a CRC-32C checksum."""
-        import google_crc32c
-
-        data = (
-            _encode_texts(block.ravel())
-            if self.dtype == "string"
-            else np.asarray(block, dtype=self.numpy_dtype).tobytes()
-        )
-        return data + struct.pack("<I", google_crc32c.value(data))
-
-    def decode_chunk(self, data: bytes) -> np.ndarray:
-        """Return the values of a chunk from the bytes of its file; raise ValueError or ``struct.error`` if they are
-        damaged."""
-        import google_crc32c
-
-        content = data[:-4]
-        if len(data) < 4 or struct.pack("<I", google_crc32c.value(content)) != data[-4:]:
-            raise ValueError("it does not have its checksum")
-        if self.dtype == "string":
-            values = np.array([*_decode_texts(content), None], dtype=object)[:-1]
-        else:
-            values = np.frombuffer(content, dtype=self.numpy_dtype).copy()
-        if values.size != math.prod(self.chunks):
-            raise ValueError(f"it has {values.size} values, and should have {math.prod(self.chunks)}")
-        return values.reshape(self.chunks)
-
-
-def _encode_texts(values: np.ndarray) -> bytes:
-    """Encode texts by the codec "vlen-utf8"."""
-    encoded_texts = [str(value).encode() for value in values]
-    return b"".join(
-        [struct.pack("<I", len(encoded_texts)), *(struct.pack("<I", len(text)) + text for text in encoded_texts)]
-    )
-
-
-def _decode_texts(data: bytes) -> Iterator[str]:
-    """Yield the texts that the codec "vlen-utf8" has encoded."""
-    (count,), offset = struct.unpack_from("<I", data), 4
-    if count > len(data) // 4:
-        raise ValueError(f"it says that it has {count} texts")
-    for _ in range(count):
-        (length,) = struct.unpack_from("<I", data, offset)
-        yield data[offset + 4 : offset + 4 + length].decode()
-        offset += 4 + length
-
-
-# -- files ------------------------------------------------------------------------------------------------------------
 
 
 def write_file(path: Path, data: bytes) -> None:
@@ -226,11 +83,6 @@ def require_plain_files(root: Path) -> None:
             raise
         except OSError as error:
             raise FileError(f"cannot read {root}: {disk.describe_os_error(error)}") from error
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON data to a file atomically."""
-    write_file(path, json.dumps(content, indent=1, allow_nan=False).encode())
 
 
 def remove_partial_files(root: Path) -> None:

@@ -1,11 +1,17 @@
-"""Validation of the metadata of a store, which may be foreign or damaged."""
+"""Zarr v3 metadata of a store, with their validation and the encoding of chunks; stores may be foreign or damaged.
+
+The chunks are encoded here, since the writer of the ``zarr`` package takes ten times as long for a small chunk and its
+reader replaces a missing chunk by fill values. The codecs are "bytes" or "vlen-utf8", and "crc32c".
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +21,170 @@ from manifolds.errors import warn
 
 from ..results.netcdf import dataclass_from_json
 from ..results.status import Laws
-from .axes import MAX_POINTS, is_valid_name
-from .files import ZarrArray
-from .solve import LAW_QUANTITIES
+from .axes import MAX_POINTS, Axes, is_valid_name
+from .solve import EMPTY_POINT_STATUS, LAW_QUANTITIES
 
-CHECKSUM_ATTRIBUTE = "sha256"
-"""Attribute of the group with the SHA-256 digest of all other metadata."""
+FILL_VALUES: dict[str, Any] = {
+    "int8": EMPTY_POINT_STATUS,
+    "int64": 0,
+    "float64": "NaN",
+    "complex128": ["NaN", "NaN"],
+    "bool": False,
+    "string": "",
+}
+"""Fill value, as JSON, of each Zarr data type that a store may contain."""
+
+MAX_CHUNK_VALUES = 2**27
+"""Maximum number of values in a chunk, a limit on the memory that a foreign store can claim."""
 
 MAX_CHUNKS = 10**7
 """Maximum number of chunks of a store; each chunk is a file in each array."""
 
-REQUIRED_ARRAY_DTYPES = {"status": ("int8",), "message": ("string",), "laws": ("float64",), "quantity": ("string",)}
-"""Allowed data types of the arrays that every store contains."""
+CHECKSUM_ATTRIBUTE = "sha256"
+"""Attribute of the group with the SHA-256 digest of all other metadata."""
+
+
+@dataclass(frozen=True)
+class ZarrArray:
+    """Metadata of one array of a store, with the encoding of its chunks.
+
+    Attributes
+    ----------
+    name : str
+    dims : tuple of str
+    shape, chunks : tuple of int
+    dtype : str
+        A data type of Zarr, one of :data:`FILL_VALUES`.
+    attributes : dict
+    """
+
+    name: str
+    dims: tuple[str, ...]
+    shape: tuple[int, ...]
+    chunks: tuple[int, ...]
+    dtype: str
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+    def metadata(self) -> dict[str, Any]:
+        """Return the content of the array's ``zarr.json``."""
+        bytes_codec = {"name": "bytes", "configuration": {"endian": "little"}}
+        return {
+            "zarr_format": 3,
+            "node_type": "array",
+            "shape": list(self.shape),
+            "data_type": self.dtype,
+            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(self.chunks)}},
+            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+            "fill_value": FILL_VALUES[self.dtype],
+            "codecs": [{"name": "vlen-utf8"} if self.dtype == "string" else bytes_codec, {"name": "crc32c"}],
+            "attributes": self.attributes,
+            "dimension_names": list(self.dims),
+            "storage_transformers": [],
+        }
+
+    @classmethod
+    def from_metadata(cls, name: str, metadata: dict[str, Any]) -> ZarrArray:
+        """Make an array from its metadata; raise ValueError, KeyError or TypeError if no study can have written
+        them."""
+        chunks, attributes = metadata["chunk_grid"]["configuration"]["chunk_shape"], metadata["attributes"]
+        dims, shape, dtype = metadata["dimension_names"], metadata["shape"], metadata["data_type"]
+        array = cls(name, tuple(dims), tuple(shape), tuple(chunks), dtype, attributes)
+        is_valid_shape = all(type(n) is int and 0 <= n < 2**48 for n in [*shape, *chunks]) and 0 not in chunks
+        if not (is_valid_shape and len(shape) == len(chunks) == len(dims) and math.prod(chunks) <= MAX_CHUNK_VALUES):
+            raise ValueError(f"the array {name!r} has shape {shape} in chunks {chunks}")
+        if not isinstance(attributes, dict) or array.metadata() != metadata:  # other readers use its codecs
+            raise ValueError(f"the array {name!r} is none that a study writes")
+        return array
+
+    @property
+    def numpy_dtype(self) -> np.dtype:
+        return np.dtype(object if self.dtype == "string" else self.dtype).newbyteorder("<")
+
+    @property
+    def chunk_grid(self) -> tuple[int, ...]:
+        """Number of chunks along each dimension."""
+        return tuple(-(-m // c) for m, c in zip(self.shape, self.chunks, strict=True))
+
+    def chunk_slices(self, index: Sequence[int]) -> tuple[slice, ...]:
+        """Return the part of the array, or of its first dimensions, that a chunk has."""
+        return tuple(slice(i * c, min((i + 1) * c, m)) for i, c, m in zip(index, self.chunks, self.shape, strict=False))
+
+    def empty_chunk(self) -> np.ndarray:
+        """Return a chunk of fill values, shape ``chunks``."""
+        fill_value = np.nan if self.dtype in ("float64", "complex128") else FILL_VALUES[self.dtype]
+        return np.full(self.chunks, fill_value, dtype=self.numpy_dtype)
+
+    def encode_chunk(self, block: np.ndarray) -> bytes:
+        """Return the bytes of a chunk's file: the encoded values and a CRC-32C checksum."""
+        if self.dtype == "string":
+            texts = [str(value).encode() for value in block.ravel()]
+            data = b"".join([struct.pack("<I", len(texts)), *(struct.pack("<I", len(text)) + text for text in texts)])
+        else:
+            data = np.asarray(block, dtype=self.numpy_dtype).tobytes()
+        return data + struct.pack("<I", _crc32c(data))
+
+    def decode_chunk(self, data: bytes) -> np.ndarray:
+        """Return the values of a chunk from the bytes of its file; raise ValueError or ``struct.error`` if they are
+        damaged."""
+        content, size = data[:-4], math.prod(self.chunks)
+        if len(data) < 4 or struct.pack("<I", _crc32c(content)) != data[-4:]:
+            raise ValueError("it does not have its checksum")
+        if self.dtype != "string":
+            values = np.frombuffer(content, dtype=self.numpy_dtype).copy()
+        elif struct.unpack_from("<I", content)[0] == size <= len(content) // 4:
+            values, offset = np.full(size, "", dtype=object), 4
+            for i in range(size):
+                (length,) = struct.unpack_from("<I", content, offset)
+                values[i] = content[offset + 4 : offset + 4 + length].decode()
+                offset += 4 + length
+        else:
+            values = np.empty(0)
+        if values.size != size:
+            raise ValueError(f"it does not have {size} values")
+        return values.reshape(self.chunks)
+
+
+def _crc32c(data: bytes) -> int:
+    import google_crc32c
+
+    return google_crc32c.value(data)
+
+
+def point_arrays(
+    axis_names: tuple[str, ...],
+    shape: tuple[int, ...],
+    chunks: tuple[int, ...],
+    measures: Mapping[str, tuple[tuple[int, ...], str]],
+    array_attributes: Mapping[str, Mapping[str, Any]],
+) -> dict[str, ZarrArray]:
+    """Return the arrays with a value at each point, of a shape and type for each measure, and the law quantities."""
+    n_quantities = len(LAW_QUANTITIES)
+    trailing: dict[str, tuple[tuple[str, ...], tuple[int, ...], str]]
+    trailing = {"status": ((), (), "int8"), "message": ((), (), "string")}
+    trailing["laws"] = ("quantity",), (n_quantities,), "float64"
+    for name, (sizes, dtype) in measures.items():
+        dims = (f"{name}_component",) if len(sizes) == 1 else tuple(f"{name}_component_{k}" for k in range(len(sizes)))
+        trailing[name] = dims, sizes, dtype
+    arrays = {
+        name: ZarrArray(name, axis_names + dims, shape + sizes, chunks + sizes, dtype, array_attributes.get(name, {}))
+        for name, (dims, sizes, dtype) in trailing.items()
+    }
+    return {**arrays, "quantity": ZarrArray("quantity", ("quantity",), (n_quantities,), (n_quantities,), "string")}
+
+
+def coordinate_arrays(
+    axes: Axes, array_attributes: Mapping[str, Mapping[str, Any]]
+) -> Iterator[tuple[ZarrArray, np.ndarray]]:
+    """Yield the coordinate arrays of the axes, with their values."""
+    for axis in axes.axes:
+        coordinates = {axis.name: axis.labels, **axis.columns}
+        if axis.states is not None:
+            coordinates[f"{axis.name}_state"] = axis.states
+        for name, values in coordinates.items():
+            dims = (axis.name, "component")[: values.ndim]
+            dtype = {"U": "string", "b": "bool", "i": "int64", "u": "int64"}.get(values.dtype.kind, "float64")
+            chunks = (max(64, 1 << (len(values) - 1).bit_length()), *values.shape[1:])
+            yield ZarrArray(name, dims, values.shape, chunks, dtype, array_attributes.get(name, {})), values
 
 
 def with_checksum(group_metadata: dict[str, Any]) -> dict[str, Any]:
@@ -38,12 +196,12 @@ def with_checksum(group_metadata: dict[str, Any]) -> dict[str, Any]:
 
 
 def parse_group_metadata(root: Path, group_metadata: dict[str, Any]) -> tuple[dict[str, ZarrArray], dict[str, Any]]:
-    """Return the arrays and the attributes of a group, from its metadata.
+    """Return the arrays and the attributes of a group, from its metadata, which may be foreign or damaged.
 
     Raises
     ------
     ValueError, KeyError, TypeError, AttributeError
-        If a study cannot have written the metadata.
+        If no study can have written the metadata.
 
     Warns
     -----
@@ -55,54 +213,32 @@ def parse_group_metadata(root: Path, group_metadata: dict[str, Any]) -> tuple[di
         warn(f"{root} has no checksum of its metadata, as an earlier version made it: damage to them would not show")
     elif attributes[CHECKSUM_ATTRIBUTE] != with_checksum(group_metadata)["attributes"][CHECKSUM_ATTRIBUTE]:
         raise ValueError("its metadata do not have the checksum that they were written with")
-    arrays = {}
-    for name, array_metadata in group_metadata["consolidated_metadata"]["metadata"].items():
-        arrays[name] = ZarrArray.from_metadata(name, array_metadata)
-        if arrays[name].metadata() != array_metadata:  # other readers use its codecs and fill values
-            raise ValueError(f"the array {name!r} is none that a study writes")
-    _require_arrays(arrays, attributes)
-    _require_study(attributes, arrays["status"].shape)
-    return arrays, attributes
-
-
-def _require_arrays(arrays: Mapping[str, ZarrArray], attributes: Mapping[str, Any]) -> None:
-    """Raise ValueError unless the store has exactly the arrays that a study writes, with matching shapes."""
-    measures, axes = attributes["measures"], attributes["axes"]
-    if not isinstance(measures, list):
-        raise ValueError("its measures are not listed")
+    stored_metadata = group_metadata["consolidated_metadata"]["metadata"]
+    arrays = {name: ZarrArray.from_metadata(name, metadata) for name, metadata in stored_metadata.items()}
+    status, measures, axes = arrays["status"], list(attributes["measures"]), attributes["axes"]
     columns = [name for axis in axes.values() for name in axis]
     for name in (*measures, *axes, *columns):
         if not is_valid_name(name):
             raise ValueError(f"nothing in it can be called {name!r:.120}")
     if shared_names := {*measures} & {*axes, *columns}:
         raise ValueError(f"{shared_names.pop()!r} is a measure and an axis")
-    states = {f"{name}_state" for name in axes} & set(arrays)
-    expected_names = {*measures, *axes, *columns, *states, *REQUIRED_ARRAY_DTYPES}
-    if set(arrays) != expected_names:
-        raise ValueError(f"it has the arrays {sorted(arrays)}, and should have {sorted(expected_names)}")
-    status = arrays["status"]
-    chunks = math.prod(-(-m // c) for m, c in zip(status.shape, status.chunks, strict=True))
-    if len(status.shape) != len(axes) or math.prod(status.shape) > MAX_POINTS or chunks > MAX_CHUNKS:
+    if math.prod(status.shape) > MAX_POINTS or math.prod(status.chunk_grid) > MAX_CHUNKS:
         raise ValueError(f"no study has points in shape {status.shape} and chunks {status.chunks}")
-    for name in (*measures, "laws", "message", "status"):
-        array, trailing_shape = arrays[name], arrays[name].shape[len(axes) :]
-        axis_dims = list(array.dims[: len(axes)])
-        if (
-            array.shape != status.shape + trailing_shape
-            or array.chunks != status.chunks + trailing_shape
-            or axis_dims != list(axes)
-        ):
-            raise ValueError(f"{name!r} has shape {array.shape} in chunks {array.chunks} along {array.dims}")
-        if array.dtype not in REQUIRED_ARRAY_DTYPES.get(name, ("float64", "complex128")):
-            raise ValueError(f"{name!r} is of type {array.dtype}")
-    if arrays["quantity"].shape != (len(LAW_QUANTITIES),) or arrays["laws"].shape[len(axes) :] != (
-        len(LAW_QUANTITIES),
-    ):
-        raise ValueError("what is known of the laws is not what this version keeps")
-    for (name, axis_dims), length in zip(axes.items(), status.shape, strict=True):
-        for array_name in (name, *axis_dims, *({f"{name}_state"} & states)):
-            if arrays[array_name].shape[:1] != (length,) or arrays[array_name].dims[:1] != (name,):
-                raise ValueError(f"{array_name!r} has {arrays[array_name].shape} values, and its axis {length}")
+    array_attributes = {name: array.attributes for name, array in arrays.items()}
+    values = {name: (arrays[name].shape[len(axes) :], arrays[name].dtype) for name in measures}
+    expected_arrays = point_arrays(tuple(axes), status.shape, status.chunks, values, array_attributes)
+    for (axis_name, column_names), length in zip(axes.items(), status.shape, strict=True):
+        for name in (axis_name, *column_names, *({f"{axis_name}_state"} & set(arrays))):
+            array = arrays[name]
+            dims, sizes = (axis_name, "component")[: len(array.shape)], array.shape[1:]
+            expected_arrays[name] = replace(array, dims=dims, shape=(length, *sizes), chunks=(array.chunks[0], *sizes))
+    for name in {*arrays} | {*expected_arrays}:
+        if arrays.get(name) != expected_arrays.get(name):
+            raise ValueError(f"no study writes the array {name!r} of this shape and type beside its other arrays")
+    if not {dtype for _, dtype in values.values()} <= {"float64", "complex128"}:
+        raise ValueError("its measures are not numbers")
+    _require_study(attributes, status.shape)
+    return arrays, attributes
 
 
 def _require_study(attributes: Mapping[str, Any], shape: tuple[int, ...]) -> None:
@@ -118,7 +254,5 @@ def _require_study(attributes: Mapping[str, Any], shape: tuple[int, ...]) -> Non
             raise ValueError(f"its study cannot have the values {entry!r:.60}")
     for entry in numbers:
         np.asarray(entry, dtype=np.float64)
-    example_index = study["place"]
-    is_inside = [type(i) is int and 0 <= i < n for i, n in zip(example_index, shape, strict=True)]
-    if not all(is_inside):
-        raise ValueError(f"its example is at {example_index!r:.60}")
+    if not all(type(i) is int and 0 <= i < n for i, n in zip(study["place"], shape, strict=True)):
+        raise ValueError(f"its example is at {study['place']!r:.60}")

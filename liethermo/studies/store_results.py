@@ -72,8 +72,6 @@ def audit_store(path: Any, **tolerances: float) -> Audit:
     min_entropy_increment, drift, residual = math.inf, 0.0, 0.0
     counts: dict[int, int] = {}
     for number, status in store.chunk_statuses():
-        if status is None:
-            continue
         for code, count in zip(*np.unique(status, return_counts=True), strict=True):
             counts[int(code)] = counts.get(int(code), 0) + int(count)
         index = store.chunk_index(number)

@@ -25,13 +25,13 @@ from ..runs.preparation import check_choice
 from ..runs.schedule import make_schedule
 from ..systems import System
 from . import files, identity
-from .axes import Axes, Zipped
+from .axes import Axes, Zipped, axes_in_store_order
 from .measures import At, Measure, SolutionMeasure, ValuesAtTimes, parse_measures_and_event
 from .members import UNKNOWN_PARAMETER_TEXT, AccessRecorder, system_builder, to_python_values
 from .progress import StudyProgressBar, StudyStatus
 from .running import run_locally, run_on_cluster
 from .solve import MEASURE_FAILED, STATUSES, PointResults, PointSolver, StudyTask, describe_error
-from .store import STORE_FORMAT, StoreSurvey, StudyStore, axes_in_store_order
+from .store import STORE_FORMAT, StoreSurvey, StudyStore
 from .store_results import audit_store, load_status, open_results, store_status
 
 if TYPE_CHECKING:

@@ -12,14 +12,14 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._arrays import is_traced
-from manifolds._pytree_module import forward_to
+from manifolds._pytree_module import forward_to, replace_fields
 from manifolds.groups import maps
 
 from ..errors import InputError
 from ..functions.energy import Energy, Linear
-from ..functions.time_span import replace_time_span
 from ..tracing.interpret import evaluate_at_points
 from .base import System
+from .clock import Clock
 from .driven import DrivenSystem
 from .lie_poisson import LiePoissonSystem
 from .lifted import LiftedSystem
@@ -47,7 +47,7 @@ class AttitudeSystem(LiftedSystem):
     ----------
     body : LiePoissonSystem, or DrivenSystem of one
     reconstruction : {"coadjoint", "cayley", "exp"}
-        Method that computes the attitude: see :class:`liethermo.WithAttitude`.
+        Method that computes the attitude: see :class:`~liethermo.integrators.WithAttitude`.
     group : manifolds.MatrixGroup
     """
 
@@ -99,28 +99,10 @@ class AttitudeSystem(LiftedSystem):
         impulse = [] if p is None else [p]
         return jnp.concatenate([mu, entries.reshape(*mu.shape[:-1], -1), *impulse], axis=-1)
 
-    def system_of_step(self, x) -> AttitudeSystem:
-        body = self.body
-        if not (isinstance(body, DrivenSystem) and body.span.breaks.size):
-            return self
-        return replace_time_span(self, body.span.interval_at(body.time(self.points(x))))
-
-    energy_jumps = forward_to("body")
-
-    def add_jump_of_energy(self, x, amount):
-        n = self.body.dim
-        return jnp.concatenate([self.body.add_jump_of_energy(x[:n], amount), x[n:]])
-
     @property
-    def work_direction(self):
-        work = self.body.work_direction
-        return None if work is None else jnp.concatenate([work, jnp.zeros(self.dim - self.body.dim)])
-
-    def clock_components(self, v):
-        mu, g = self.split_state(v)
-        return self.join_state(
-            self.body.clock_components(mu), jnp.zeros_like(g), self.spatial_impulse(v) if self.torque_name else None
-        )
+    def clock(self) -> Clock | None:
+        clock = self.body.clock
+        return clock and replace_fields(clock, n_last_counters=self.group.dim if self.has_impulse else 0)
 
     def body_at_attitude(self, x) -> LiePoissonSystem | DrivenSystem:
         """Return the body with its torque bound to the attitude of a state."""

@@ -243,56 +243,6 @@ class System(SystemInterface):
         """
         return self, x
 
-    def system_of_step(self, x) -> System:
-        """Return the system for a step that starts at x, shape (n,).
-
-        Functions of time that jump at the end of this step have their limits from before, and those that jump at its
-        start their limits from after.
-
-        Parameters
-        ----------
-        x : array, shape (n,)
-        """
-        return self
-
-    @property
-    def energy_jumps(self) -> bool:
-        """True if the energy may jump at a break of the span."""
-        return False
-
-    def add_jump_of_energy(self, x, amount) -> jax.Array:
-        """Return x with a jump of the energy added to the work, if a step from x starts at a break.
-
-        Parameters
-        ----------
-        x : array, shape (n,)
-        amount : array, shape ()
-            Energy after the jump minus the energy before.
-        """
-        return x
-
-    @property
-    def work_direction(self) -> jax.Array | None:
-        """Return the displacement, shape (n,), that adds one unit to the work done; None if states contain no work."""
-        return None
-
-    def error_of_step(self, x, error, mean_slope) -> jax.Array:
-        """Return the error of a step from x, over its size, with the error of the work as one of the state, shape (n,).
-
-        A step that is corrected onto the level of the energy less the work moves the state by the error of the work.
-
-        Parameters
-        ----------
-        x : array, shape (n,)
-        error, mean_slope : array, shape (n,)
-            Estimated error and displacement of the step, both over its size.
-        """
-        return error
-
-    def clock_components(self, v) -> jax.Array:
-        """Return v, shape (n,), with zeros in all components but those that only count: a clock, and the work done."""
-        return jnp.zeros_like(v)
-
     def to_user_solution(self, solution: Any) -> Any:
         """Return a solution in the form that the user sees."""
         return reshape_to_sites(self, solution)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 
@@ -21,6 +23,8 @@ class RunCondition:
         Explanation for the reader of the audit.
     concerns_model : bool
         True if the condition is one of the validity of the equations, and not of the run.
+    is_minimum : bool
+        True if the number is the least one along the run, and False if it is the largest.
     """
 
     name: str
@@ -29,3 +33,15 @@ class RunCondition:
     holds: bool | None = None
     note: str = ""
     concerns_model: bool = False
+    is_minimum: bool = False
+
+
+def worst_conditions(runs: Iterable[Iterable[RunCondition]]) -> tuple[RunCondition, ...]:
+    """Return the conditions of several runs, for each name the one with the worst number."""
+    worst: dict[str, RunCondition] = {}
+    for condition in (condition for conditions in runs for condition in conditions):
+        other = worst.setdefault(condition.name, condition)
+        is_worse = condition.value < other.value if condition.is_minimum else condition.value > other.value
+        if is_worse or not math.isfinite(condition.value):
+            worst[condition.name] = condition
+    return tuple(worst.values())

@@ -18,8 +18,9 @@ from ..errors import InputError
 from ..functions.checks import with_polynomial_degrees
 from ..functions.coordinates import ComponentMap
 from ..functions.energy import ChartEnergy, Energy, Linear, Pullback, Quadratic, StateTimeEnergy, Sum
-from ..functions.time_span import TimeSpan, replace_time_span
+from ..functions.time_span import TimeSpan
 from .base import System
+from .clock import WORK_NAME, Clock
 from .lifted import LiftedSystem
 
 CLOCK_UNIT = 2.0**-100
@@ -40,7 +41,7 @@ class DrivenSystem(LiftedSystem):
     energy, so it conserves ``H - W`` for every gradient, continuous or discrete.
 
     Functions of time may jump at the breaks of the span. There a step ends, which sees the limit from before, and the
-    next one sees the limit from after [:meth:`system_of_step`]. A jump of H at a fixed state is work.
+    next one sees the limit from after [:func:`.clock.system_of_step`]. A jump of H at a fixed state is work.
 
     A state consists of the state of the body, t and W, in units of ``unit``. :func:`liethermo.integrate` builds it from
     a system whose energy depends on time, or on which a torque acts.
@@ -90,40 +91,16 @@ class DrivenSystem(LiftedSystem):
         clock = jnp.broadcast_to(jnp.array([t * self.unit, 0.0]), (*x.shape[:-1], 2))
         return jnp.concatenate([x, clock], axis=-1)
 
-    def clock_components(self, v):
-        return jnp.concatenate([jnp.zeros_like(v[:-2]), v[-2:]])
-
     def user_state(self, x):
         return self.body.points(x[..., :-2])
 
+    @property
+    def clock(self) -> Clock:
+        return Clock(self.span, self.body.dim, self.unit, self.body.energy.depends_on_time)
+
     def time(self, x) -> jax.Array:
         """Return the time t of states, shape (...), clipped to the span of the run."""
-        return self.span.clip(x[..., -2] / self.unit)
-
-    def system_of_step(self, x) -> DrivenSystem:
-        if not self.span.breaks.size:
-            return self
-        return replace_time_span(self, self.span.interval_at(self.time(x)))
-
-    @property
-    def energy_jumps(self) -> bool:
-        return bool(self.span.breaks.size) and self.body.energy.depends_on_time
-
-    def add_jump_of_energy(self, x, amount):
-        return x.at[-1].add(jnp.where(self.span.starts_at_break(self.time(x)), self.unit * amount, 0.0))
-
-    @property
-    def work_direction(self):
-        return jnp.zeros(self.dim).at[-1].set(self.unit)
-
-    def error_of_step(self, x, error, mean_slope):
-        gradient_norm = jnp.linalg.norm(self.energy.gradient(x)[:-2])
-        speed = jnp.linalg.norm(mean_slope[:-2])
-        # the mean gradient along the step, which is not zero where the body starts from rest
-        mean_gradient = jnp.abs(mean_slope[-1]) / (self.unit * jnp.where(speed > 0.0, speed, jnp.inf))
-        gradient_norm = jnp.maximum(gradient_norm, mean_gradient)
-        displacement = error[-1] / (self.unit * jnp.where(gradient_norm > 0.0, gradient_norm, jnp.inf))
-        return error.at[-1].set(displacement)
+        return self.clock.time(x)
 
     def work(self, x) -> jax.Array:
         """Return the work W of states, shape (...)."""
@@ -210,9 +187,7 @@ class DrivenSystem(LiftedSystem):
 
     @property
     def ledger(self):
-        return {"work": Quadratic(jnp.zeros(self.dim), jnp.zeros(self.dim).at[-1].set(1.0 / self.unit))}
-
-    balance_entries = ("work",)
+        return {WORK_NAME: Quadratic(jnp.zeros(self.dim), jnp.zeros(self.dim).at[-1].set(1.0 / self.unit))}
 
     def to_user_solution(self, solution):
         dense, body = solution.dense, self.body
@@ -222,7 +197,7 @@ class DrivenSystem(LiftedSystem):
         if body.lie_algebra is not None:
             entries["algebra"] = body.lie_algebra.name
         entries["dissipation"] = None if body.dissipation is None else type(body.dissipation).__name__
-        energy = solution.energy + solution.casimirs["work"]
+        energy = solution.energy + solution.casimirs[WORK_NAME]
         body_solution = dataclasses.replace(solution, x=x, energy=energy, dense=dense).with_provenance(**entries)
         return body.to_user_solution(body_solution)
 

@@ -17,6 +17,7 @@ from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.surface import Surface
 from .baths import HeatBaths
+from .clock import Clock
 from .conditions import RunCondition
 
 
@@ -174,8 +175,8 @@ class SystemInterface(Geometry):
         ----------
         x : array, shape (m, n)
             States of the run.
-        t : array, shape (m,)
-            Their times.
+        t : array, shape (k,)
+            Times of the run, such as those of the states.
         guarantees : frozenset of str
             What the method keeps to rounding: see :class:`liethermo.integrators.base.Guarantee`.
         """
@@ -239,6 +240,11 @@ class SystemInterface(Geometry):
     def drop_torque(self) -> Self:
         """Return the system without its external torque."""
         return self
+
+    @property
+    def clock(self) -> Clock | None:
+        """Components of a state that hold the time and the work, with the span of the run; None if there are none."""
+        return None
 
     # -- spins ----------------------------------------------------------------------------------------------------
 
@@ -313,11 +319,6 @@ class SystemInterface(Geometry):
     @property
     def constant_names(self) -> tuple[str, ...]:
         """Names of constants of the motion with several components, such as a momentum in space."""
-        return ()
-
-    @property
-    def balance_entries(self) -> tuple[str, ...]:
-        """Entries of the ledger that the energy of a solution contains; laws are stated after subtracting them."""
         return ()
 
     # -- states as users see them -------------------------------------------------------------------------------------

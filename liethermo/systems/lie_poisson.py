@@ -64,7 +64,8 @@ class LiePoissonSystem(TorqueSystem):
         adds. The momentum in space is ``Ad_star(inverse(g), mu)``, and it is constant if no torque acts.
     reconstruction : {"coadjoint", "cayley", "exp"}, optional
         The map of the attitude. The default keeps the spatial momentum of a free body, if the group has such a map;
-        else it is Cayley's map, if that stays in the group. See :class:`liethermo.WithAttitude`.
+        else it is Cayley's map, if that stays in the group. ``"exp"`` stays in every
+        group, and keeps the spatial momentum to the order of the method.
     baths : HeatBaths, optional
         The baths that take the heat of a dissipation that lowers the energy (energy of H, entropies in energy /
         temperature). A state is then mu, in one row, followed by the entropies of the baths. If these are left out of

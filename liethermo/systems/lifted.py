@@ -85,7 +85,6 @@ class LiftedSystem(System):
     orbit_levels = forward_to("inner")
     has_angular_velocity = forward_to("inner")
     joint_ranges = forward_to("inner")
-    balance_entries = forward_to("inner")
     surface = forward_to("inner")
     can_unroll = forward_to("inner")
     has_matrix_functions = forward_to("inner")

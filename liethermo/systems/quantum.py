@@ -160,7 +160,7 @@ class QuantumSystem(System):
 
     @property
     def is_driven(self) -> bool:
-        """True if the Hamiltonian or a rate depends on time."""
+        """True if the Hamiltonian, a rate or a jump operator depends on time."""
         return super().is_driven or (
             self.time is None and self.dissipation is not None and self.dissipation.depends_on_time
         )
@@ -321,10 +321,10 @@ class QuantumSystem(System):
         conditions = []
         if self._has_dissipation(LindbladJumps):
             note = "the method keeps the density matrix positive only to the error of its steps"
-            row = RunCondition(POSITIVITY_ROW, smallest, note=note)
+            row = RunCondition(POSITIVITY_ROW, smallest, note=note, is_minimum=True)
             if "positivity" in guarantees:
                 limit = -NEGATIVE_EIGENVALUE_LIMIT
-                row = RunCondition(POSITIVITY_ROW, smallest, limit, smallest >= limit)
+                row = RunCondition(POSITIVITY_ROW, smallest, limit, smallest >= limit, is_minimum=True)
             conditions.append(row)
         if self._has_dissipation(AdiabaticJumps):
             parameter = float(np.max(np.asarray(self.adiabatic_parameter(np.unique(t)))))

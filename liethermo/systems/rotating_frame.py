@@ -14,7 +14,7 @@ import manifolds as mf
 from manifolds._pytree_module import Module
 from manifolds.matrices.linear import adjoint
 
-from ..dissipation.lindblad import LindbladJumps
+from ..dissipation.lindblad import LindbladJumps, OperatorFunction
 from ..dissipation.operators import Operator, checked_hermitian, checked_square_matrix, level_gap_rounding
 from ..dissipation.quantum import cluster_labels
 from ..errors import InputError
@@ -153,6 +153,8 @@ class RotatingFrame:
         """
         jumps = LindbladJumps(couplings)
         for i, V in enumerate(jumps.operators):
+            if isinstance(V, OperatorFunction):
+                raise InputError(f"the jump operator V[{i}] depends on time. Give it in the frame to LindbladJumps")
             frequencies = list(self.components(V))
             if len(frequencies) > 1:
                 raise InputError(

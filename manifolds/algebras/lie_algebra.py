@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arrays import is_traced, real_components, square_matrices
+from .._arrays import is_traced, real_array, real_components, square_matrices
 from .._names import checked_names
 from ..errors import LieAlgebraError, ParameterError
 from ._basis_scaling import STRUCTURE_TOLERANCE, balance_constants
@@ -273,11 +273,13 @@ class LieAlgebra(StructureMethods):
 
     def bracket(self, x, y) -> jax.Array:
         """Return the Lie bracket ``[x, y]``; ``x``, ``y`` and the result have shape (..., dim)."""
-        return jnp.einsum("abc,...a,...b->...c", self.structure_constants, self._element(x, "x"), self._element(y, "y"))
+        return jnp.einsum(
+            "abc,...a,...b->...c", real_array(self.structure_constants), self._element(x, "x"), self._element(y, "y")
+        )
 
     def ad(self, x) -> jax.Array:
         """Return the matrix of ``y -> [x, y]``, shape (..., dim, dim): ``ad(x) @ y == bracket(x, y)``."""
-        return jnp.einsum("abc,...a->...cb", self.structure_constants, self._element(x, "x"))
+        return jnp.einsum("abc,...a->...cb", real_array(self.structure_constants), self._element(x, "x"))
 
     def ad_star(self, x, mu) -> jax.Array:
         """Return the coadjoint operator ``ad*_x mu``, defined by ``<ad*_x mu, y> = <mu, [x, y]>`` [BFM, after 3.1].
@@ -299,7 +301,7 @@ class LieAlgebra(StructureMethods):
             If the last axes differ from ``dim``.
         """
         return jnp.einsum(
-            "abc,...a,...c->...b", self.structure_constants, self._element(x, "x"), self._element(mu, "mu")
+            "abc,...a,...c->...b", real_array(self.structure_constants), self._element(x, "x"), self._element(mu, "mu")
         )
 
     def poisson_tensor(self, mu) -> jax.Array:

@@ -94,10 +94,10 @@ class Polynomial:
         """Return the value at ``mu``, shape (..., dim) -> (...)."""
         mu = real_components(mu, self.dim, "mu")
         # Products of gathered components: mu**0 would have the derivative 0 * mu**-1, which is NaN at zero.
-        mu_and_one = jnp.concatenate([mu, jnp.ones((*mu.shape[:-1], 1))], axis=-1)
-        values = jnp.ones((*mu.shape[:-1], len(self.terms)))
-        for factor in self._factor_indices:
-            values = values * mu_and_one[..., factor]
+        mu_and_one = jnp.concatenate([mu, np.ones((*mu.shape[:-1], 1))], axis=-1)
+        values = np.ones((*mu.shape[:-1], len(self.terms)))
+        for factor in self._factor_indices:  # not by brackets, whose checks of indices XLA would compile
+            values = values * jnp.take(mu_and_one, factor, axis=-1, mode="clip")
         return values @ np.array([float(c) for c in self.coefficients])
 
     @cached_property

@@ -32,6 +32,7 @@ def free_body_run(inertia, mu0, t_end, times=None, rate=0.0):
     return solve_ivp(f, (0.0, t_end), start, "DOP853", t_eval=times, rtol=3e-14, atol=1e-15)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)], ids=str)
 @pytest.mark.parametrize("mu0", [(0.3, 0.2, 1.0), (1.0, 0.3, -0.2), (0.02, 0.0, 1.0)], ids=str)
 def test_periods_against_an_integration(mu0, order):
@@ -147,6 +148,7 @@ def test_the_damping_time_of_a_solid_body():
 # -- relaxation times --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("inertia", [(162.75, 162.75, 37.5), (37.5, 162.75, 162.75), (3.0, 0.5, 3.0)], ids=str)
 def test_a_rod_comes_to_its_flat_spin_in_the_relaxation_time(inertia):
     """``tan theta = tan theta_0 exp(t / tau)`` from the long axis, at every angle; it was reached in tau / 2."""

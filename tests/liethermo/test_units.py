@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
-from liethermo.units import parse_unit, split_label
+from liethermo.units import parse_unit, quantity_in_si, split_label
 
 FACTORS = {
     "ms": 1e-3,
@@ -83,3 +83,19 @@ def test_a_unit_that_is_not_known_is_refused_by_name(name, words):
 )
 def test_a_label_is_a_name_with_a_unit(label, parts):
     assert split_label(label) == parts
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("0.5 deg/s", np.pi / 360.0), ("5e-1deg/s", np.pi / 360.0), ("3 ms", 3e-3), ("2 degC", 2.0), (".5 kg m^2/s", 0.5)],
+)
+def test_a_number_with_a_unit(text, value):
+    assert quantity_in_si(text) == pytest.approx(value, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"), [("deg", "no number with a unit"), ("3", "no number"), ("3 dog", "unknown")]
+)
+def test_a_text_that_is_no_quantity_is_refused(text, words):
+    with pytest.raises(lt.InputError, match=words):
+        quantity_in_si(text)

@@ -91,6 +91,7 @@ def test_a_rate_is_no_function_of_time():
         lt.ThermalJumps([(A, lambda t: KAPPA * np.exp(-t))])
 
 
+@pytest.mark.slow
 def test_stepping_and_a_rate_that_is_switched_off():
     """A run in two parts; in the second the rate is zero, and the number of quanta stays (1e-6)."""
     decaying, lossless = (lt.QuantumSystem(NUMBER, decay(A, rate), cold()) for rate in (1.0, 0.0))
@@ -143,6 +144,7 @@ def jaynes_cummings(levels, frequency, coupling):
     return H, a.T @ a, sm.T @ sm
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", [20.0, pytest.param(1000.0, marks=pytest.mark.slow)])
 def test_vacuum_rabi_oscillations(end):
     """Case 1: photons and excitation are exchanged with ``2 g sqrt(n + 1)``; QuTiP asks for 5e-3 up to t = 1000."""
@@ -156,7 +158,7 @@ def test_vacuum_rabi_oscillations(end):
     assert run.audit().passed
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 def test_decay_without_interaction():
     """Case 2: a cavity and an atom that decay each by itself, kappa = 0.005 and gamma = 0.01; QuTiP asks for 5e-3."""
     w, kappa, gamma, n = 2.0 * np.pi, 0.005, 0.01, 2
@@ -180,6 +182,7 @@ STEPS = {
 }
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", STEPS)
 def test_step_functions_turn_a_qubit_by_half_a_turn(name):
     """The end is ``sigma_x`` times the start, to a fidelity of 1e-6; the jump is at the end of a step."""

@@ -75,6 +75,7 @@ def crossing_2(t, y):
     return (t * y[1]) ** 0.6 - y[0]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_integration(method):
     """test_integration, forwards: errors at the steps, at 50 times and at one time, within five tolerances."""
@@ -88,6 +89,7 @@ def test_integration(method):
         assert (res.njev, res.nlu) == (0, 0)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_integration_const_jac(method):
     """Errors are measured by the size of the state: SciPy measures each component, which is small near its zero."""
@@ -101,6 +103,7 @@ def test_integration_const_jac(method):
             assert np.all(compute_error(states, sol_linear(times)) < 10)
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 @pytest.mark.parametrize(("direction", "numbers"), [(0, (1, 1)), (1, (1, 0)), (-1, (0, 1))])
 def test_events(method, direction, numbers):
@@ -188,6 +191,7 @@ def test_first_step():
             solve_ivp(RATIONAL, [5, 9], AT_5, first_step=first_step)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "times", [np.linspace(5, 9, 10), [5, 5.01, 7, 8, 8.01, 9], [5.01, 7, 8, 8.01]], ids=["grid", "ends", "between"]
 )
@@ -304,6 +308,7 @@ def test_array_rtol():
             error(**bad_tolerances)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_integration_zero_rhs(method):
     res = solve_ivp(canonical(lambda x: 0.5 * x[1] ** 2, 1), [0, 10], [1.0, 0.0], method)
@@ -318,6 +323,7 @@ def test_initial_state_finiteness(fill):
         solve_ivp(OSCILLATOR, [0, 10], np.full(2, fill))
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_tbound_respected_small_interval(method):
     t_end = 1e-4
@@ -327,6 +333,7 @@ def test_tbound_respected_small_interval(method):
     assert res.y[:, -1] == pytest.approx(np.exp([2 * t_end, -2 * t_end]), rel=1e-12)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", METHODS[:2], ids=str)
 def test_tbound_respected_oscillator(method):
     """A constant field that is not known after t = 205, in steps as long as the span."""

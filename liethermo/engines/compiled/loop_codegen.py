@@ -89,7 +89,7 @@ def compile_step_loop(
     function.args[0].add_attribute("noalias")
     _StepLoopWriter(function, programs, layout, state_names, is_per_trajectory, lanes, saved_names).write_loops()
     begin = ir.Function(module, ir.FunctionType(ir.VoidType(), [FLOAT64_POINTER, FLOAT64_POINTER, INT64]), "begin")
-    _StepLoopWriter(begin, programs, layout, state_names, is_per_trajectory, lanes, saved_names).write_begin()
+    _StepLoopWriter(begin, programs, layout, state_names, is_per_trajectory, lanes, saved_names).write_start_function()
     return MachineCode(module, skip_optimisation)
 
 
@@ -214,7 +214,7 @@ class _StepLoopWriter(ProgramWriter):
             self.store_rows(self.state_names)
         build.ret(argument["count"])
 
-    def write_begin(self) -> None:
+    def write_start_function(self) -> None:
         """Write ``begin(p, blocks, count)``, which computes the initial engine state of each block from its x."""
         with self.loop_range(self.arguments["count"]) as i:
             self.select_block(i)

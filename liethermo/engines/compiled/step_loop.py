@@ -21,6 +21,7 @@ import numpy as np
 from ...integrators import OneStepMethod
 from ...integrators.fluctuating import noise_dimension, with_noise_increments
 from ...systems import System
+from ...systems.clock import system_of_step
 from ...tracing.caching import LRUCache
 from ...tracing.calls import deferred_p
 from ...tracing.scalarize import report_compiler_faults, scalarize
@@ -301,7 +302,8 @@ class CompiledStepLoop:
         self._newton_code: MachineCode | None = None
         self._structures = structures
         system = structures[0].build(parameters[: structures[0].n_parameters])
-        n, slopes_shape = system.dim, jax.eval_shape(lambda x: method.start(system, x), jnp.zeros(system.dim)).shape
+        n, state = system.dim, jax.ShapeDtypeStruct((system.dim,), np.float64)
+        slopes_shape = jax.eval_shape(lambda x: method.start(system, x), state).shape
         self._shapes: dict[str, tuple[int, ...]] = {
             "x": (n,),
             "compensation": (n,),
@@ -404,7 +406,7 @@ class CompiledStepLoop:
         arrays = [packed[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, shapes, strict=True)]
         inputs = NewtonInputs(*arrays[len(NEWTON_OUTPUTS) :])
         equations = stage_equations(
-            system.system_of_step(inputs.x),
+            system_of_step(system, inputs.x),
             with_noise_increments(method, inputs.dW),
             inputs.x,
             inputs.compensation,

@@ -182,7 +182,7 @@ class DiscreteSystem(Module):
         points = self._points_of_maps(self.lagrangian_maps, Pair(q0, V, S0, s))
         return _sum_arrays([p.weight * self.system.lagrangian_value(p.q, p.v, p.S) for p in points])
 
-    def impulses(self, pair: Pair, friction: bool = True, external: bool = True) -> tuple[jax.Array, jax.Array]:
+    def forces_over_step(self, pair: Pair, friction: bool = True, external: bool = True) -> tuple[jax.Array, jax.Array]:
         """Return ``F^-_d / h`` and ``F^+_d / h``, shape (n,) each."""
         impulse_minus = impulse_plus = jnp.zeros_like(pair.V)
         for p in self._points_of_maps(self.force_maps, pair):
@@ -196,7 +196,7 @@ class DiscreteSystem(Module):
     def momentum_residual(self, p0, pair: Pair) -> jax.Array:
         """Return the residual of ``p_0 = -D_1 L_d - F^-_d``, (3.12) with the momentum of the last step, shape (n,)."""
         dL_dq, dL_dV = jax.grad(self.action, argnums=(0, 1))(*pair)
-        return p0 - dL_dV + self.h * (dL_dq + self.impulses(pair)[0])
+        return p0 - dL_dV + self.h * (dL_dq + self.forces_over_step(pair)[0])
 
     def motion_residual(self, p0, pair: Pair, mass: float | jax.Array = 1.0) -> jax.Array:
         """Return the momentum residual, shape (n,); on a manifold along Q, plus the distance of q_1 from Q.
@@ -217,7 +217,7 @@ class DiscreteSystem(Module):
 
         On a manifold it is the part tangent to the manifold.
         """
-        impulse_minus, impulse_plus = self.impulses(pair)
+        impulse_minus, impulse_plus = self.forces_over_step(pair)
         force = jax.grad(self.action)(*pair) + (impulse_minus + impulse_plus)
         return force if self.curve is None else force - self.momentum_residual(p0, pair) / self.h
 
@@ -232,7 +232,7 @@ class DiscreteSystem(Module):
 
     def work_and_heat_rates(self, pair: Pair) -> tuple[jax.Array, jax.Array]:
         """Return the work and the heat received from outside, per unit of time."""
-        impulse_minus, impulse_plus = self.impulses(pair, friction=False)
+        impulse_minus, impulse_plus = self.forces_over_step(pair, friction=False)
         heat = _sum_arrays(
             [p.weight * self.system.heating(*p[2:]) for p in self._points_of_maps(self.constraint_maps, pair)]
         )
@@ -255,7 +255,7 @@ class DiscreteSystem(Module):
 
     def forces(self, q0, q1, S0, S1, friction: bool = True, external: bool = True) -> tuple[jax.Array, jax.Array]:
         """Return the discrete forces ``F^-_d`` and ``F^+_d``, impulses of shape (n,) each [GBY Definition 3.2]."""
-        impulse_minus, impulse_plus = self.impulses(self.pair(q0, q1, S0, S1), friction, external)
+        impulse_minus, impulse_plus = self.forces_over_step(self.pair(q0, q1, S0, S1), friction, external)
         return self.h * impulse_minus, self.h * impulse_plus
 
     def constraint(self, q0, q1, S0, S1) -> jax.Array:

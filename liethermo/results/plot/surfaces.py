@@ -98,9 +98,9 @@ def momentum_sphere(
         scene.draw_solid(conserved_quantity.function, conserved_quantity.label(0))
     if changing_quantity is not None:
         scene.draw_contours(changing_quantity.function, 12)
-        scene.draw_sections(changing_quantity.function, 0, ORANGE, changing_quantity.label(0))
+        scene.draw_level_surface(changing_quantity.function, 0, ORANGE, changing_quantity.label(0))
         if not changing_quantity.is_constant:
-            scene.draw_sections(changing_quantity.function, -1, BLUE, changing_quantity.label(-1))
+            scene.draw_level_surface(changing_quantity.function, -1, BLUE, changing_quantity.label(-1))
     _draw_trajectory(solution, scene)
 
     name = "x" if solution.provenance.get("algebra") is None else r"\mu"
@@ -256,7 +256,7 @@ class _Scene:
         """Draw the level surface of the function through the first state, with its outline; sections if it is open."""
         surface = _LevelSurface(function, self.states[0], self.extent)
         if not surface.is_closed:
-            self.draw_sections(function, 0, GREY, label)
+            self.draw_level_surface(function, 0, GREY, label)
             return
         self.solid, self.mesh = surface, surface.intersect_rays(sphere_grid(96, 192))
         normals = np.cross(np.gradient(self.mesh, axis=0), np.gradient(self.mesh, axis=1))
@@ -277,7 +277,7 @@ class _Scene:
             for level in np.linspace(values.min(), values.max(), count + 2)[1:-1]:
                 self._draw_contour(values, level, color=GREY, linewidth=0.4)
 
-    def draw_sections(self, function: PointFunction, index: int, color: str, label: str) -> None:
+    def draw_level_surface(self, function: PointFunction, index: int, color: str, label: str) -> None:
         """Draw plane sections of the level surface through a state, and its intersection with the solid."""
         surface = _LevelSurface(function, self.states[index], self.extent)
         if not surface.is_simple:

@@ -190,6 +190,19 @@ def test_a_fast_drive_is_named_by_the_audit():
     assert audit.verdict.endswith("THE EQUATIONS ARE USED WHERE THEY ARE NOT VALID")
 
 
+def test_the_audit_of_an_ensemble_shows_the_worst_adiabatic_parameter():
+    """``|H'| / (2 gap^2)`` of a field that turns at the rate w is w / (2 |field|): the weakest field is the worst."""
+    field = [(SZ, lambda t: 0.5 * jnp.cos(0.3 * t)), (SX, lambda t: 0.5 * jnp.sin(0.3 * t))]
+    system = lt.QuantumSystem(field, lt.AdiabaticJumps([(SY, RATE)]), baths=reservoir())
+    parameter = float(np.max(system.adiabatic_parameter([0.0, 0.5])))
+    many = lt.ensemble(system, [RHO, RHO], (0.0, 1.0), 0.05)
+    row = next(row for row in many.audit().rows if row.law == "adiabatic parameter")
+    assert row.value == pytest.approx(parameter, rel=1e-9)
+    assert row.passed is False
+    assert many.audit().passed  # the laws hold, the equations do not
+    assert many.audit().verdict.endswith("THE EQUATIONS ARE USED WHERE THEY ARE NOT VALID")
+
+
 def test_a_rate_that_is_infinite_at_zero_is_refused_where_it_is_used():
     """The advice works: the rate of an ohmic bath is finite at zero."""
 

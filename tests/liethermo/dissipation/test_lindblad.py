@@ -135,6 +135,70 @@ def test_rates_that_depend_on_time_are_those_of_dop853():
         lt.LindbladJumps([(LOWER, lambda omega, T: 1.0)])
 
 
+def turning_operator(t, numpy=jnp):
+    """A jump operator of two frequencies, which is no constant matrix times a rate."""
+    return LOWER + 0.5 * numpy.exp(1.3j * t) * SX + 0.2j * numpy.cos(t) * SZ
+
+
+@pytest.mark.parametrize(("method", "error"), [(METHOD, 1e-9), (lt.KrausMethod(4), 1e-6)], ids=["Gauss", "Kraus"])
+def test_jump_operators_that_depend_on_time_are_those_of_dop853(method, error):
+    H, rate = 0.5 * SZ + 0.3 * SX, lambda t: 0.2 * (1.5 + jnp.sin(t))
+    system = lt.QuantumSystem(H, lt.LindbladJumps([(turning_operator, rate), (SZ, 0.05)]))
+    assert system.is_driven
+
+    def field(t, v):
+        return liouvillian(H, [(turning_operator(t, np), 0.2 * (1.5 + np.sin(t))), (SZ, 0.05)]) @ v
+
+    expected = scipy.integrate.solve_ivp(
+        field, (0.0, 4.0), RHO.ravel().astype(complex), method="DOP853", rtol=1e-12, atol=1e-13
+    ).y[:, -1]
+    run = lt.integrate(system, system.state(RHO), (0.0, 4.0), 0.02, method)
+    np.testing.assert_allclose(system.density(run.x[-1]).ravel(), expected, atol=error)
+    assert np.ptp(run.casimirs["tr(rho)"]) < 1e-13
+    audit = run.audit()
+    assert audit.passed
+    rows = {row.law: row for row in audit.rows}
+    assert not any("entropy" in law and row.passed is not None for law, row in rows.items())  # none is promised
+    positivity = rows["least eigenvalue of rho"]
+    assert positivity.value == pytest.approx(np.linalg.eigvalsh(system.density(run.x)).min(), abs=1e-6)
+    assert positivity.passed is (True if isinstance(method, lt.KrausMethod) else None)
+    V, A = turning_operator(0.7, np), 0.3 * SX + SZ  # the current of an observable at a time, from its definition
+    square = V.conj().T @ V
+    expected_current = (0.2 * (1.5 + np.sin(0.7))) * np.trace(
+        A @ (V @ RHO @ V.conj().T - 0.5 * square @ RHO - 0.5 * RHO @ square)
+    )
+    jumps = lt.LindbladJumps([(turning_operator, rate)])
+    np.testing.assert_allclose(jumps.current(RHO, A, 0.7), expected_current.real, atol=1e-14)
+
+
+def test_an_operator_in_a_rotating_frame_has_the_motion_of_the_laboratory():
+    """In the frame of G a jump operator V is ``exp(i G t) V exp(-i G t)``; the laboratory's V is constant."""
+    G, V, rate = 0.8 * np.diag([1.0, 0.0, -0.6]), np.eye(3, k=1) + np.diag([1.0, -1.0, 0.5]), 0.3
+    rho = np.diag([0.2, 0.3, 0.5])
+    laboratory = lt.QuantumSystem(G, lt.LindbladJumps([(V, rate)]))
+    levels = jnp.asarray(np.diag(G))
+
+    def operator(t):
+        return jnp.exp(1j * levels[:, None] * t) * V * jnp.exp(-1j * levels * t)
+
+    frame = lt.QuantumSystem(np.zeros((3, 3)), lt.LindbladJumps([(operator, rate)]))
+    end, other = (lt.integrate(s, s.state(rho), (0.0, 3.0), 0.05, METHOD).x[-1] for s in (laboratory, frame))
+    U = np.diag(np.exp(1j * np.diag(G) * 3.0))
+    np.testing.assert_allclose(frame.density(other), U @ laboratory.density(end) @ U.conj().T, atol=1e-10)
+
+
+def test_operators_that_are_no_functions_of_time_are_refused():
+    with pytest.raises(lt.InputError, match="returns a Qobj"):
+        lt.LindbladJumps([(lambda t: FakeQobj(LOWER), 0.1)])
+    with pytest.raises(lt.InputError, match="function of the time t"):
+        lt.LindbladJumps([(lambda omega, T: LOWER, 0.1)])
+    with pytest.raises(lt.InputError, match="shape"):
+        lt.QuantumSystem(SZ, lt.LindbladJumps([(lambda t: jnp.eye(3), 0.1)]))
+    frame = lt.RotatingFrame(SZ)
+    with pytest.raises(lt.InputError, match="depends on time"):
+        frame.jumps([(turning_operator, 0.1)])
+
+
 @pytest.mark.parametrize(
     ("coefficient", "times", "words"),
     [

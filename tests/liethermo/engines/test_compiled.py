@@ -23,8 +23,8 @@ from liethermo.runs import problem
 from tests.cases import DISSIPATIONS, build, state_of
 from tests.liethermo import random_systems
 from tests.machine_code import copy_at_offset
+from tests.systems import rigid_body
 
-BODY = lt.models.rigid_body()
 X0 = [0.001, 1.0, 0.001]
 
 
@@ -71,7 +71,7 @@ def test_same_trajectories(algebra, dissipation, gradient):
 
 
 def test_the_body_of_the_paper():
-    a, b = run_both_engines(BODY, X0, (0.0, 500.05), 0.1)
+    a, b = run_both_engines(rigid_body(), X0, (0.0, 500.05), 0.1)
     assert_equal_runs(a, b)
     assert b.audit(energy=1e-14).passed
     assert b.entropy[-1] == pytest.approx(10 * b.energy[0], rel=1e-14)
@@ -80,7 +80,7 @@ def test_the_body_of_the_paper():
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("save_every", [7, 10_000])
 def test_save_every(save_every):
-    assert_equal_runs(*run_both_engines(BODY, X0, (0.0, 30.05), 0.1, save_every=save_every))
+    assert_equal_runs(*run_both_engines(rigid_body(), X0, (0.0, 30.05), 0.1, save_every=save_every))
 
 
 def test_newton_on_demand():
@@ -131,8 +131,8 @@ def test_every_engine_goes_by_the_rules_it_is_given():
 def test_rules_of_large_systems_in_machine_code():
     """Steps of "large" systems, which select all of a state at once, compile and give the same states."""
     for method in (lt.MetriplecticGauss(1), lt.MetriplecticRungeKutta(4)):
-        default_engine = CompiledEngine(BODY, method)
-        large_engine = CompiledEngine(BODY, method, SolverOptions(matrix_free_dim=2))
+        default_engine = CompiledEngine(rigid_body(), method)
+        large_engine = CompiledEngine(rigid_body(), method, SolverOptions(matrix_free_dim=2))
         state = large_engine.advance(large_engine.initial_run_state(X0), 0.1, 1, 20)[0]
         assert int(state.status) == StatusCode.COMPLETED
         assert (
@@ -140,7 +140,7 @@ def test_rules_of_large_systems_in_machine_code():
             < 1e-14
         )
     limited_engine = CompiledEngine(
-        BODY,
+        rigid_body(),
         lt.MetriplecticGauss(1),
         SolverOptions(matrix_free_dim=2, max_fixed_point_iterations=1, max_newton_iterations=1),
     )
@@ -153,10 +153,10 @@ def test_what_takes_minutes_to_compile_is_said(monkeypatch):
     monkeypatch.setattr(problem, "_cached_problem", problem._cached_problem.__wrapped__)  # no engine of another test
     monkeypatch.setattr("liethermo.engines.select_engine.SLOW_COMPILE_OPERATIONS", 2)
     with pytest.warns(CompiledEngineWarning, match=r"takes minutes to compile\. Leave out engine"):
-        lt.integrate(BODY, X0, (0.0, 1.0), 0.1, engine="compiled")
+        lt.integrate(rigid_body(), X0, (0.0, 1.0), 0.1, engine="compiled")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        lt.integrate(BODY, X0, (0.0, 1.0), 0.1)
+        lt.integrate(rigid_body(), X0, (0.0, 1.0), 0.1)
 
 
 def test_code_is_optimised_once_many_steps_are_taken(tmp_path, monkeypatch):
@@ -294,7 +294,7 @@ def test_newtons_method_that_cannot_be_compiled(adaptive):
 
 def test_auto_compiles_small_systems_and_long_runs(monkeypatch):
     monkeypatch.setattr(problem, "_cached_problem", problem._cached_problem.__wrapped__)  # no engine of another test
-    chosen_engine = lambda: lt.integrate(BODY, X0, (0.0, 1.0), 0.1).provenance["engine"]  # noqa: E731
+    chosen_engine = lambda: lt.integrate(rigid_body(), X0, (0.0, 1.0), 0.1).provenance["engine"]  # noqa: E731
     assert chosen_engine() == "compiled"
     monkeypatch.setattr("liethermo.engines.select_engine.MAX_AUTO_COMPILED_OPERATIONS", 2)
     assert chosen_engine() == "array"

@@ -81,6 +81,7 @@ FAULTS = {
 """Patches that raise an error in a part of the compiler."""
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_of_the_compiler_is_no_fault_of_the_run(fault, monkeypatch, fresh_programs):
     system = lt.LiePoissonSystem(mf.so(3), sine)

@@ -95,6 +95,7 @@ def test_an_iteration_is_slow_by_its_last_update_and_by_the_last_two():
     assert slowness_by_update([1.0, 2.0, 4.0, 8.0], 0.6)[1:] == [True] * 3
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("h", [0.05, 0.6])
 def test_spins_in_line_that_a_bath_shakes(h):
     """The bath is corrected a hundred times as much as the spins, in turns: that alone needs no Newton's method."""

@@ -81,7 +81,7 @@ def test_continuous_across_the_gate(name):
     assert (jumps <= 20 * np.diff(distances) + 1e-12).all()
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled("symmetric_coordinate_increment")
 @pytest.mark.parametrize("name", ["gonzalez", "mean_value", "symmetric_coordinate_increment"])
 @given(seed=seeds)
 def test_symmetric_in_its_end_points(name, seed):

@@ -32,6 +32,7 @@ def energy_difference(build, constant, method, steps, h, **options):
     return np.abs(levels[1] - levels[0]).max(), run
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("constant", [1.0, -1.0, 100.0, 1e4])
 def test_a_state_that_relaxes(constant):
     """Relaxation goes on beside a constant; it once ended at t = 3 beside 1, at t = 0.6 beside 100."""

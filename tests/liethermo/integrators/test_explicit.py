@@ -194,7 +194,7 @@ def assert_laws_after_relaxation(case, method, end):
     assert run.stats.rejected > 0
 
 
-@pytest.mark.sampled("MetriplecticRungeKutta(order=6)-rubbing_body", "MetriplecticRungeKutta(order=8)-rubbing_body")
+@pytest.mark.sampled("MetriplecticRungeKutta(order=8)-rubbing_body")
 @pytest.mark.parametrize("case", RELAXING)
 @each_method
 def test_adaptive_steps_keep_the_laws_after_relaxation(method, case):

@@ -30,6 +30,7 @@ def sine_profile(t):
     return 0.25 * jnp.pi * jnp.sin(0.5 * jnp.pi * t)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("unit", [1.0, 1e-9])
 @pytest.mark.parametrize("method", EXPLICIT_METHODS, ids=str)
 @pytest.mark.parametrize("step", [0.0625, 0.125])
@@ -45,6 +46,7 @@ def test_a_constant_torque_stops_a_body_at_the_end_of_a_step(method, step, unit)
     assert solution.audit().passed
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", EXPLICIT_METHODS, ids=str)
 def test_the_momentum_at_rest_has_the_order_of_the_method(method):
     """The work is not exact here, and the energy at rest cannot take its error: the work does, and the laws hold."""

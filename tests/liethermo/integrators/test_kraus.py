@@ -22,6 +22,7 @@ def observed_orders(system, expected, steps, order):
     return np.log2(np.array(errors[:-1]) / errors[1:])
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("order", [2, 4])
 def test_order_with_a_constant_generator(order):
     system = lt.QuantumSystem(H, lt.LindbladJumps(JUMPS))
@@ -30,6 +31,7 @@ def test_order_with_a_constant_generator(order):
     assert (orders > order - 0.2).all()
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("order", [2, 4])
 def test_order_with_a_drive_and_rates_that_depend_on_time(order):
     system = lt.QuantumSystem(
@@ -51,6 +53,7 @@ def test_order_with_a_drive_and_rates_that_depend_on_time(order):
     np.testing.assert_allclose(run.casimirs["work"][-1], expected[4].real, atol={2: 2e-4, 4: 2e-7}[order])
 
 
+@pytest.mark.sampled("30.0-4")
 @pytest.mark.parametrize("order", [2, 4])
 @pytest.mark.parametrize("step", [0.3, 3.0, 30.0])
 def test_every_step_is_a_channel(order, step):
@@ -74,6 +77,26 @@ def test_a_method_that_is_no_channel_leaves_the_cone():
     assert np.linalg.eigvalsh(system.density(run.x)).min() < -1e-3
     row = next(row for row in run.audit().rows if row.law == "least eigenvalue of rho")
     assert row.passed is None
+
+
+@pytest.mark.parametrize("outputs", ["final", "trajectory"])
+def test_the_audit_of_an_ensemble_shows_the_least_eigenvalue(outputs, tmp_path):
+    """The worst trajectory is the one that starts in the upper level; a quantum channel keeps the others positive."""
+    system = lt.QuantumSystem(H, lt.LindbladJumps([(LOWER, 4.0)]))
+    states = np.stack([np.eye(2) / 2, UPPER_LEVEL])
+    rows = {}
+    for method in (lt.KrausMethod(2), lt.MetriplecticGauss(1)):
+        many = lt.ensemble(system, states, (0.0, 8.0), 2.0, method, outputs=outputs, parameters=None)
+        rows[type(method)] = next(row for row in many.audit().rows if row.law == "least eigenvalue of rho")
+        many.save(tmp_path / "many.nc")
+        assert str(lt.load(tmp_path / "many.nc").audit()) == str(many.audit())
+    assert rows[lt.KrausMethod].passed
+    assert rows[lt.KrausMethod].value > -1e-14
+    gauss = rows[lt.MetriplecticGauss]
+    assert gauss.passed is None
+    if outputs == "trajectory":
+        expected = min(np.linalg.eigvalsh(system.density(many.x))[np.isfinite(many.energy)].min(), 0.0)
+        assert gauss.value == pytest.approx(expected, abs=1e-12)
 
 
 def test_a_fast_precession_needs_no_short_steps():

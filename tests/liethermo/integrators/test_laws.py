@@ -79,7 +79,7 @@ def test_every_algebra(g):
     assert_laws(system, run(system, state_of(g, 0)), lt.MetriplecticMidpoint())
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("g", "case"), [*combinations([mf.so(3)]), *map(slow_case, combinations([mf.se(3)]))])
 def test_every_dissipation(g, case):
     system = build(g, case)

@@ -216,7 +216,7 @@ class ZeroVelocityBracket(lt.DoubleBracket):
         return jnp.zeros_like(dH)
 
 
-@pytest.mark.sampled("SO(3)-midpoint", "SE(3)-gauss2", "SL(2)-rk4", "SO(4)-midpoint")
+@pytest.mark.sampled("SE(3)-gauss2", "SL(2)-rk4")
 @pytest.mark.parametrize(
     ("name", "method"),
     [
@@ -246,12 +246,12 @@ def test_friction_inside_keeps_the_momentum_in_space(name, method):
 MATRIX_GROUPS = [mf.SO(2), mf.SO(3), mf.SO(4), mf.SO(5), mf.SE(2), mf.SE(3), mf.SU(2), mf.SU(3), mf.SL(2)]
 MATRIX_GROUPS += [mf.Sp(1), mf.Sp(2), mf.GL(2), mf.Heisenberg(1), mf.Heisenberg(2)]
 ADJOINT_GROUPS = {"SO(2)", "SO(3)", "SO(4)", "SE(2)", "SE(3)", "SU(2)", "SL(2)", "Sp(1)", "GL(2)", "Heisenberg(1)"}
-"""Groups in which the end of collocation is an adjoint action: see :class:`liethermo.WithAttitude`."""
+"""Groups in which the end of collocation is an adjoint action: see :class:`~liethermo.integrators.WithAttitude`."""
 ADJOINT_GROUPS |= {"Heisenberg(2)"}
-"""Groups in which the end of collocation is an adjoint action: see :class:`liethermo.WithAttitude`."""
+"""Groups in which the end of collocation is an adjoint action: see :class:`~liethermo.integrators.WithAttitude`."""
 
 
-@pytest.mark.sampled("SO(3)", "GL(2)")
+@pytest.mark.sampled("SO(3)")
 @pytest.mark.parametrize("group", [pytest.param(group, id=group.name) for group in MATRIX_GROUPS])
 def test_the_momentum_in_space_of_a_body_that_heats_over_every_group(group):
     """The spatial momentum is constant to rounding, 1e-15 measured, or to the order, as the audit then says."""
@@ -388,7 +388,7 @@ UNIT_TEST_METHODS = {
 }
 
 
-@pytest.mark.sampled("midpoint-cayley-compiled-fixed", "rk4-compiled-fixed", "rk8-compiled-adaptive")
+@pytest.mark.sampled("rk4-compiled-fixed")
 @pytest.mark.parametrize(
     ("method", "kind", "engine", "step"),
     [

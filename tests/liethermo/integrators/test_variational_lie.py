@@ -140,7 +140,7 @@ def forced_system():
     )
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled("LieVariational-2.0", "MetriplecticGauss(stages=2)-4.0")
 @pytest.mark.parametrize(
     ("method", "order"),
     [

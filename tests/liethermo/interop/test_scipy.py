@@ -84,6 +84,7 @@ def test_events_are_those_of_scipy(direction):
 TIMES = np.linspace(*SPAN, 50)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("method", [None, lt.MetriplecticGauss(3), lt.MetriplecticRungeKutta(4)], ids=str)
 @pytest.mark.parametrize("rtol", [1e-6, 1e-9])
 def test_events_are_zeros_and_as_accurate_as_asked_and_the_laws_hold_there(rtol, method):

@@ -11,6 +11,7 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.learn import training
 from liethermo.learn.data import Trajectory, spline_states_and_rates
+from liethermo.learn.fitting import checked_noise
 from liethermo.learn.losses import differentiable_stepper
 from liethermo.learn.observation import make_observation, states_matching_rates
 
@@ -289,3 +290,15 @@ def test_an_observation_that_cannot_be_used_has_an_error_of_one_line(how, words)
     with pytest.raises((lt.InputError, lt.FunctionError), match=words) as raised:
         lt.learn.fit(cases.oscillator(), (T, X), **how)
     assert "\n" not in str(raised.value)
+
+
+def test_noise_with_a_unit_is_the_same_as_in_si_units():
+    """The states of a table with units are in SI units, so ``"0.5 deg"`` is 0.0087 rad."""
+    for noise, values in (("0.5 deg", np.pi / 360.0), (["0.5 deg", 0.01], [np.pi / 360.0, 0.01])):
+        np.testing.assert_allclose(checked_noise(noise, 2), np.broadcast_to(values, 2), rtol=1e-15)
+    data = cases.oscillator(), cases.record(2, 21)
+    how = {"matching": 0, "shooting": 20, "rate": 0.1, "window": 5}
+    fits = [lt.learn.fit(*data, noise=noise, **how) for noise in ("0.6 deg", np.radians(0.6))]
+    np.testing.assert_array_equal(fits[0].training.loss, fits[1].training.loss)
+    with pytest.raises(lt.InputError, match="unknown unit"):
+        lt.learn.fit(*data, noise="0.6 dog", **how)

@@ -21,6 +21,7 @@ def _failed_axioms(system):
     return {row.axiom for row in system.check().rows if row.passed is False}
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("construction", "dim", "failed_rows"), [("skew", 4, {"Jacobi"}), ("projected", 3, set())])
 def test_the_laws_hold_before_training(construction, dim, failed_rows):
     """With every part learned. The Jacobi identity is not built in, and the check says so.

@@ -91,6 +91,7 @@ def test_a_tensor_is_never_taken_for_the_moments_of_three_bodies():
         lt.ensemble(lambda row: lt.models.tumbling_body(row, rate=0.1), OMEGA, (0.0, 0.1), 0.1, parameters=rows)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("tensor", [False, True])
 @pytest.mark.parametrize("model", ["free_rigid_body", "tumbling_body"])
 def test_a_slender_rod_turns_steadily(model, tensor):

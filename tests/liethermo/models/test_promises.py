@@ -32,7 +32,7 @@ PROMISES = {
 }
 
 
-@pytest.mark.sampled(5)  # all but one of wheels: each takes as long as the rest together
+@pytest.mark.sampled("thermo_springs-MetriplecticRungeKutta(order=6)", "free rigid body-MetriplecticGauss(stages=2)")
 @pytest.mark.parametrize("method", [lt.MetriplecticRungeKutta(6), lt.MetriplecticGauss(2)], ids=str)
 @pytest.mark.parametrize("name", PROMISES)
 def test_promised_constants_are_held_and_audited(name, method):

@@ -53,6 +53,7 @@ def test_a_nutation_damper_against_velocities(ring):
     assert np.allclose(run.provenance["inertia"], np.diag(INERTIA), rtol=0, atol=1e-14)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "method",
     [

@@ -51,6 +51,7 @@ def test_eigenvalues_are_sorted_and_kept():
     np.testing.assert_allclose(np.diag(L).real, eigenvalues[[1, 0, 3, 2]], atol=1e-9)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("n", [3, 4])
 def test_toda_is_the_qr_algorithm(n):
     a, b = np.random.default_rng(3).standard_normal((2, n))

@@ -15,6 +15,7 @@ def run():
     return lt.integrate(body, x0, (0.0, 8.0), 0.25, lt.MetriplecticGauss(2), attitude=start)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("scalar", ["last", "first"])
 @pytest.mark.parametrize("degrees", [False, True])
 def test_what_is_written_is_read_back(run, tmp_path, degrees, scalar):

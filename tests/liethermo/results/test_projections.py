@@ -43,6 +43,7 @@ def test_invariants_draws_each_of_them(run):
     (ax,) = lt.plot.invariants(solution, system).axes
     assert len(ax.lines) == 4
     assert max(float(line.get_ydata().max()) for line in ax.lines) < 1e-12
+    assert {float(line.get_ydata()[0]) for line in ax.lines} == {float(np.finfo(float).eps)}  # changes from the start
 
 
 def test_faults_are_named(run):

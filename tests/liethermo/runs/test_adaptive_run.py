@@ -16,8 +16,8 @@ from liethermo.engines.growth_rate import arnoldi_hessenberg
 from liethermo.engines.step_control import step_size_after_acceptance, step_size_after_rejection
 from liethermo.runs import adaptive_run
 from liethermo.tracing.scalarize import UnsupportedPrimitive
+from tests.systems import rigid_body
 
-BODY = lt.models.rigid_body()
 X0 = [0.001, 1.0, 0.001]
 
 
@@ -103,7 +103,7 @@ def test_the_estimate_scales_with_the_motion():
 @pytest.mark.slow
 def test_steps_grow_as_a_body_relaxes():
     """At most 300 steps to t = 10^4; the last are of the size of the whole relaxation."""
-    solution = lt.integrate(BODY, X0, (0.0, 1e4), lt.Adaptive(1e-8), lt.MetriplecticGauss(4))
+    solution = lt.integrate(rigid_body(), X0, (0.0, 1e4), lt.Adaptive(1e-8), lt.MetriplecticGauss(4))
     assert solution.stats.steps <= 300
     assert solution.audit().passed
     assert solution.entropy[-1] == pytest.approx(10 * solution.energy[0], rel=1e-14)
@@ -238,7 +238,7 @@ def test_suggest_step(exact):
         assert np.abs(solution.x[-1] - exact).max() < 10 * solution.stats.steps * rtol
         assert solution.stats.steps < 2000
     with pytest.raises(lt.InputError, match="nothing moves"):
-        lt.suggest_step(BODY, [1.0, 0.0, 0.0])
+        lt.suggest_step(rigid_body(), [1.0, 0.0, 0.0])
 
 
 # -- what grows -------------------------------------------------------------------------------------------------------
@@ -272,7 +272,7 @@ def test_a_body_on_its_middle_axis_falls_when_it_has_to(p, rtol, stages, max_err
     x0 = [p, 1.0, p]
     exact = falls(relaxed_body, x0, lambda t, x: x[0] - 0.5, 600.0)
     method = lt.MetriplecticGauss(stages)
-    solution = lt.integrate(BODY, x0, (0.0, 600.0), lt.Adaptive(rtol), method, until=lambda x: x[0] - 0.5)
+    solution = lt.integrate(rigid_body(), x0, (0.0, 600.0), lt.Adaptive(rtol), method, until=lambda x: x[0] - 0.5)
     assert solution.event_time == pytest.approx(exact, rel=0.005)
     assert solution.stats.steps < max_error
 
@@ -329,8 +329,8 @@ def wells(n):
 @pytest.mark.slow
 def test_suggested_steps_resolve_what_grows():
     """At the top of a saddle nothing seems to move, and any step would do for the estimate of the error."""
-    h = lt.suggest_step(BODY, [1e-10, 1.0, 1e-10], 1e-6, lt.MetriplecticGauss(2))
-    rate = np.linalg.eigvals(np.asarray(jax.jacfwd(BODY.vector_field)(jnp.array([0.0, 1.0, 0.0])))).real.max()
+    h = lt.suggest_step(rigid_body(), [1e-10, 1.0, 1e-10], 1e-6, lt.MetriplecticGauss(2))
+    rate = np.linalg.eigvals(np.asarray(jax.jacfwd(rigid_body().vector_field)(jnp.array([0.0, 1.0, 0.0])))).real.max()
     assert 0.05 < h * rate < 1.2
 
 
@@ -340,11 +340,11 @@ def test_suggested_steps_resolve_what_grows():
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-9)])
 def test_relaxed(step):
-    solution = lt.integrate(BODY, X0, (0.0, 1e4), step, lt.MetriplecticGauss(3), until=lt.Relaxed(1e-8))
+    solution = lt.integrate(rigid_body(), X0, (0.0, 1e4), step, lt.MetriplecticGauss(3), until=lt.Relaxed(1e-8))
     assert solution.status.code == "event"
     assert solution.status.ok
     assert solution.t[-1] == solution.event_time
-    assert float(BODY.entropy_production(solution.x[-1])) == pytest.approx(1e-8, rel=1e-10)
+    assert float(rigid_body().entropy_production(solution.x[-1])) == pytest.approx(1e-8, rel=1e-10)
     assert solution.audit().passed  # the last state too is a step's end
 
 
@@ -363,22 +363,23 @@ def test_an_event_is_located_to_rounding():
 
 def test_steps_that_are_looked_at_are_those_of_the_timetable():
     """A thousand steps of 0.1 to t = 100, and at the same times."""
-    default_run = lt.integrate(BODY, X0, (0.0, 100.0), 0.1)
-    run_with_event = lt.integrate(BODY, X0, (0.0, 100.0), 0.1, until=lambda x: x[0] - 5.0)
+    default_run = lt.integrate(rigid_body(), X0, (0.0, 100.0), 0.1)
+    run_with_event = lt.integrate(rigid_body(), X0, (0.0, 100.0), 0.1, until=lambda x: x[0] - 5.0)
     assert run_with_event.stats.steps == default_run.stats.steps == 1000
     assert np.array_equal(run_with_event.t, default_run.t)
     assert np.array_equal(run_with_event.x, default_run.x)
-    stops = lt.integrate(BODY, X0, (0.0, 1.05), 0.1, save_at=[0.3, 0.75])
+    stops = lt.integrate(rigid_body(), X0, (0.0, 1.05), 0.1, save_at=[0.3, 0.75])
     assert stops.stats.steps == 3 + 5 + 3
 
 
 def test_an_event_that_never_happens():
-    solution = lt.integrate(BODY, X0, (0.0, 10.0), 0.1, until=lambda x: x[0] - 5.0)
+    solution = lt.integrate(rigid_body(), X0, (0.0, 10.0), 0.1, until=lambda x: x[0] - 5.0)
     assert (solution.status.code, solution.event_time) == ("completed", None)
     assert "did not happen" in solution.status.message
     assert solution.t[-1] == 10.0
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-3)], ids=["fixed", "adaptive"])
 @pytest.mark.parametrize(
     "until",
@@ -387,14 +388,14 @@ def test_an_event_that_never_happens():
 )
 def test_of_a_function_that_is_not_a_number_at_the_end_nothing_is_known(until, step):
     """The function may have been zero: that the event has not happened would be a guess."""
-    solution = lt.integrate(BODY, X0, (0.0, 20.0), step, until=until)
+    solution = lt.integrate(rigid_body(), X0, (0.0, 20.0), step, until=until)
     assert solution.x[-1, 1] < 0.995
     assert solution.event_time is None
     assert "whether the event (the event function) happened is unknown" in solution.status.message
 
 
 def test_a_file_keeps_the_event(tmp_path):
-    solution = lt.integrate(BODY, X0, (0.0, 1e3), 0.1, until=lt.Relaxed(1e-6))
+    solution = lt.integrate(rigid_body(), X0, (0.0, 1e3), 0.1, until=lt.Relaxed(1e-6))
     assert lt.load(solution.save(tmp_path / "run.nc")).event_time == solution.event_time
 
 
@@ -415,7 +416,7 @@ def test_save_at(step):
 
 def test_dense_output_is_asked_for():
     with pytest.raises(lt.InputError, match="dense=True"):
-        lt.integrate(BODY, X0, (0.0, 1.0), 0.1)(0.5)
+        lt.integrate(rigid_body(), X0, (0.0, 1.0), 0.1)(0.5)
 
 
 @pytest.mark.parametrize(
@@ -430,7 +431,7 @@ def test_dense_output_is_asked_for():
     ],
 )
 def test_bad_input(arguments, message):
-    default = {"system": BODY, "x0": X0, "t_span": (0.0, 1.0), "step": 0.1}
+    default = {"system": rigid_body(), "x0": X0, "t_span": (0.0, 1.0), "step": 0.1}
     with pytest.raises((lt.InputError, lt.FunctionError), match=message):
         lt.integrate(**(default | arguments))
 

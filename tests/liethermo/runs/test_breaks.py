@@ -69,6 +69,7 @@ def body_with_undeclared_pulses():
     return lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1.0 / INERTIA), torque=undeclared_pulses)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("method", "step", "max_error"), METHODS, ids=str)
 def test_thruster_pulses_are_integrated_to_the_tolerance(body, reference, method, step, max_error):
     solution = lt.integrate(body, X0, (0.0, END), step, method)
@@ -150,6 +151,7 @@ def switched_reference():
     return m, work
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("is_right_continuous", [True, False])
 @pytest.mark.parametrize(
     ("method", "step", "max_error"),
@@ -249,6 +251,7 @@ def test_smooth_drives_have_no_features():
 # -- errors of quadratures ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("frequency", [1.0, 10.0])
 @pytest.mark.parametrize(
     "method", [*map(lt.MetriplecticRungeKutta, (4, 6, 8)), lt.MetriplecticTaylor(), lt.MetriplecticGauss(3)], ids=str
@@ -288,3 +291,73 @@ def test_breaks_that_depend_on_the_parameters_of_an_ensemble_are_refused():
         lt.ensemble(build, [0.1, 0.2, 0.3], (0.0, 3.0), 0.1, parameters=delays)
     for delay in delays:
         assert lt.integrate(build(delay), [0.1, 0.2, 0.3], (0.0, 3.0), 0.1).status.ok
+
+
+KNOTS = np.array([0.0, 1.3, 2.1, 4.05, 6.6, 8.9, 15.0])
+
+MOMENTS = 0.1 * np.random.default_rng(0).standard_normal((len(KNOTS), 3))
+"""Torques at these times; the last is after the end of the run."""
+
+
+@pytest.fixture(scope="module")
+def reference_with_table():
+    """The last momentum under a linear table by SciPy, which starts again at each of its times."""
+    m = X0
+    for start, end in itertools.pairwise([*KNOTS[:-1], END]):
+        run = solve_ivp(
+            lambda t, m: np.cross(m, m / INERTIA) + [np.interp(t, KNOTS, column) for column in MOMENTS.T],
+            *((start, end), m, "DOP853"),
+            rtol=1e-13,
+            atol=1e-14,
+        )
+        m = run.y[:, -1]
+    return m
+
+
+def body_with_table(kind="linear"):
+    return lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1.0 / INERTIA), torque=lt.torques.Tabulated(KNOTS, MOMENTS, kind))
+
+
+@pytest.mark.parametrize(("method", "step", "max_error"), METHODS, ids=str)
+def test_steps_end_at_the_times_of_a_linear_table(reference_with_table, method, step, max_error):
+    run = lt.integrate(body_with_table(), X0, (0.0, END), step, method)
+    assert np.isin(KNOTS[:-1], run.t).all()
+    assert np.abs(run.x[-1] - reference_with_table).max() < 2.0 * max_error
+    assert run.audit().passed or isinstance(method, lt.Reference)  # whose energy has the error of its steps
+
+
+def test_a_step_across_a_kink_would_lose_the_order(reference_with_table):
+    """The control: the same values as a function that declares nothing."""
+
+    def torque(t, m):
+        return jnp.stack([jnp.interp(t, KNOTS, column) for column in MOMENTS.T])
+
+    body = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1.0 / INERTIA), torque=torque)
+    run = lt.integrate(body, X0, (0.0, END), lt.Adaptive(1e-9), lt.MetriplecticRungeKutta(8))
+    assert np.abs(run.x[-1] - reference_with_table).max() > 1e-8
+
+
+def test_times_of_a_table_that_are_no_stops(reference_with_table):
+    """A table finer than the steps, one whose pieces are smooth, and one with more than the largest number of times."""
+    method = lt.MetriplecticGauss(2)
+    for body, step in ((body_with_table(), 4.0), (body_with_table("cubic"), 0.5)):
+        assert not np.isin(KNOTS[1:-1], lt.integrate(body, X0, (0.0, END), step, method).t).any()
+    every_second = lt.integrate(body_with_table(), X0, (0.0, END), 0.5, method, save_every=2)
+    np.testing.assert_allclose(every_second.t, np.arange(13.0))
+    times = np.linspace(0.0, END, 2000)
+    long_table = lt.torques.Tabulated(times, 0.1 * np.sin(times)[:, None] * np.ones(3))
+    body = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1.0 / INERTIA), torque=long_table)
+    run = lt.integrate(body, X0, (0.0, END), lt.Adaptive(1e-6), lt.MetriplecticRungeKutta(4))
+    assert run.stats.steps < 1000
+
+
+def test_tables_in_ensembles(reference_with_table):
+    body, method = body_with_table(), lt.MetriplecticRungeKutta(6)
+    scales = np.array([1.0, 0.5])
+    many = lt.ensemble(
+        body, X0, (0.0, END), lt.Adaptive(1e-9), method, parameters={"torque.moments": scales[:, None, None] * MOMENTS}
+    )
+    assert np.abs(many.x[0] - reference_with_table).max() < 2e-9
+    delayed = np.stack([KNOTS, KNOTS + 0.2])  # no common times at which steps could end
+    other = lt.ensemble(body, X0, (0.0, END), 0.01, method, parameters={"torque.times": delayed})
+    assert np.abs(other.x[0] - reference_with_table).max() < 1e-4

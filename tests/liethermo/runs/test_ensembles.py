@@ -9,8 +9,8 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines.status_codes import STATUS_NAMES
+from tests.systems import rigid_body
 
-BODY = lt.models.rigid_body()
 ENGINES = ("array", "compiled")
 ENGINE_CASES = (pytest.param("array", marks=pytest.mark.slow), "compiled")
 
@@ -23,12 +23,12 @@ def states(number, dim=3, seed=0):
 def test_each_is_the_trajectory_it_would_be_alone(engine):
     """37 trajectories leave lanes empty; 20.05 is no multiple of the step."""
     x0s = states(37)
-    ensemble = lt.ensemble(BODY, x0s, (0.0, 20.05), 0.1, outputs="trajectory", save_every=7, engine=engine)
+    ensemble = lt.ensemble(rigid_body(), x0s, (0.0, 20.05), 0.1, outputs="trajectory", save_every=7, engine=engine)
     assert (ensemble.x.shape, ensemble.energy.shape, ensemble.entropy.shape) == ((37, 31, 3), (37, 31), (37, 31))
     assert ensemble.ok.all()
     assert ensemble.audit().passed
     for i in (0, 15, 16, 36):
-        one = lt.integrate(BODY, x0s[i], (0.0, 20.05), 0.1, save_every=7)
+        one = lt.integrate(rigid_body(), x0s[i], (0.0, 20.05), 0.1, save_every=7)
         assert np.array_equal(one.t, ensemble.t)
         assert np.abs(one.x - ensemble.x[i]).max() <= 1e-13
         assert np.abs(one.entropy - ensemble.entropy[i]).max() <= 1e-13
@@ -38,15 +38,15 @@ def test_each_is_the_trajectory_it_would_be_alone(engine):
 
 def test_a_trajectory_does_not_depend_on_its_neighbours():
     x0s = states(40)
-    ensemble = lt.ensemble(BODY, x0s, (0.0, 10.0), 0.1, engine="compiled")
-    reversed_ensemble = lt.ensemble(BODY, x0s[::-1], (0.0, 10.0), 0.1, engine="compiled")
+    ensemble = lt.ensemble(rigid_body(), x0s, (0.0, 10.0), 0.1, engine="compiled")
+    reversed_ensemble = lt.ensemble(rigid_body(), x0s[::-1], (0.0, 10.0), 0.1, engine="compiled")
     assert np.array_equal(ensemble.x, reversed_ensemble.x[::-1])
 
 
 def test_outputs():
     x0s = states(5)
     path, final, summary = (
-        lt.ensemble(BODY, x0s, (0.0, 5.0), 0.1, outputs=outputs, engine="compiled")
+        lt.ensemble(rigid_body(), x0s, (0.0, 5.0), 0.1, outputs=outputs, engine="compiled")
         for outputs in ("trajectory", "final", "summary")
     )
     assert (final.x.shape, summary.x) == ((5, 3), None)
@@ -55,7 +55,7 @@ def test_outputs():
     assert np.array_equal(summary.entropy, path.entropy[:, -1])
     drift = np.abs(path.energy - path.energy[:, :1]).max(axis=1)
     drift /= np.maximum(np.abs(path.energy[:, 0]), path.energy_sensitivity)
-    gradient = np.linalg.norm(BODY.energy.linear_part(path.x.reshape(-1, 3)), axis=-1)
+    gradient = np.linalg.norm(rigid_body().energy.linear_part(path.x.reshape(-1, 3)), axis=-1)
     sensitivity = (gradient * np.linalg.norm(path.x.reshape(-1, 3), axis=-1)).reshape(5, 51).max(axis=1)
     assert np.allclose(path.energy_sensitivity, sensitivity, rtol=1e-14)
     assert np.array_equal(summary.energy_drift, drift)
@@ -66,7 +66,7 @@ def test_outputs():
 @pytest.mark.parametrize("engine", ENGINES)
 def test_named_parameters(engine):
     rates, x0 = np.linspace(0.1, 2.0, 20), [0.3, 1.0, 0.2]
-    ensemble = lt.ensemble(BODY, x0, (0.0, 5.0), 0.1, parameters={"dissipation.rate": rates / 2}, engine=engine)
+    ensemble = lt.ensemble(rigid_body(), x0, (0.0, 5.0), 0.1, parameters={"dissipation.rate": rates / 2}, engine=engine)
     for i in (0, 13):
         one = lt.integrate(lt.models.rigid_body(rate=rates[i]), x0, (0.0, 5.0), 0.1)
         assert np.abs(one.x[-1] - ensemble.x[i]).max() <= 1e-14
@@ -140,7 +140,7 @@ def test_newton_where_a_lane_needs_it(engine):
     """One stiff body among soft ones."""
     rates = np.array([0.5, 0.5, 100.0, 0.5])
     ensemble = lt.ensemble(
-        BODY, [0.1, 1.0, 0.1], (0.0, 50.0), 0.5, parameters={"dissipation.rate": rates}, engine=engine
+        rigid_body(), [0.1, 1.0, 0.1], (0.0, 50.0), 0.5, parameters={"dissipation.rate": rates}, engine=engine
     )
     one = lt.integrate(lt.models.rigid_body(rate=200.0), [0.1, 1.0, 0.1], (0.0, 50.0), 0.5)
     assert one.stats.newton_iterations > 0
@@ -183,7 +183,7 @@ def test_interrupted(monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("liethermo.engines.array_engine._advance_batch", interrupt)
-    ensemble = lt.ensemble(BODY, states(3), (0.0, 1.0), 0.1, engine="array")
+    ensemble = lt.ensemble(rigid_body(), states(3), (0.0, 1.0), 0.1, engine="array")
     assert [STATUS_NAMES[code] for code in ensemble.status] == ["interrupted"] * 3
     assert not ensemble.steps.any()
 
@@ -235,6 +235,6 @@ def test_what_cannot_be_compiled():
     ],
 )
 def test_bad_input(arguments, message):
-    default = {"system": BODY, "x0s": np.array([0.1, 1.0, 0.1]), "t_span": (0.0, 1.0), "step": 0.1}
+    default = {"system": rigid_body(), "x0s": np.array([0.1, 1.0, 0.1]), "t_span": (0.0, 1.0), "step": 0.1}
     with pytest.raises(lt.InputError, match=message):
         lt.ensemble(**(default | arguments))

@@ -27,7 +27,7 @@ def steep():
     return lt.MetriplecticSystem(mf.Canonical(1), lambda x: 0.5 * x[1] ** 2 - 0.25 * x[0] ** 4), 10.0, 0.01
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("case", "method", "adaptive"),
     [

@@ -13,6 +13,7 @@ from liethermo.functions.gradients import DISCRETE_GRADIENTS
 MILLION = 1_000_000
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("h", [1e-5, 0.05, 0.1])
 def test_free_body_energy_after_a_million_steps(h):
     """Relative drift below 2e-14: compensated summation, and an iteration that stops at its plateau and not before."""

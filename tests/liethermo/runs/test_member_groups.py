@@ -236,6 +236,7 @@ def test_an_interruption_stops_all_groups(monkeypatch):
     assert ensemble.status.tolist() == [StatusCode.INTERRUPTED] * 3
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("outputs", ["final", "trajectory", "summary"])
 def test_files_of_mixed_groups(tmp_path, outputs):
     ensemble = lt.ensemble(body, START, SPAN, STEP, parameters={"a": A}, outputs=outputs)

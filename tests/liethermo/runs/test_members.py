@@ -10,8 +10,8 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines.status_codes import StatusCode
+from tests.systems import rigid_body
 
-BODY = lt.models.rigid_body()
 SPAN = (0.0, 6.0)
 STEP = 0.1
 
@@ -51,7 +51,7 @@ def test_a_member_is_the_solution_of_its_own_run(family, outputs):
 
 
 def test_counting():
-    ensemble = lt.ensemble(BODY, states(3), SPAN, STEP)
+    ensemble = lt.ensemble(rigid_body(), states(3), SPAN, STEP)
     assert [s.x[-1].tolist() for s in ensemble] == ensemble.x.tolist()
     assert np.array_equal(ensemble[-1].x, ensemble[2].x)
     with pytest.raises(IndexError, match="from -3 to 2, got 3"):
@@ -59,7 +59,7 @@ def test_counting():
     with pytest.raises(lt.InputError, match="must be an integer"):
         ensemble["2"]
     with pytest.raises(lt.InputError, match="no states were kept"):
-        lt.ensemble(BODY, states(3), SPAN, STEP, outputs="summary")[0]
+        lt.ensemble(rigid_body(), states(3), SPAN, STEP, outputs="summary")[0]
 
 
 @pytest.mark.slow
@@ -84,11 +84,12 @@ def test_members_with_attitudes_and_with_work(outputs):
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("outputs", ["final", "trajectory", "summary"])
 def test_save_and_load(tmp_path, outputs):
     x0s = states(5)
     x0s[2, 1] = np.nan
-    ensemble = lt.ensemble(BODY, x0s, SPAN, STEP, outputs=outputs, save_every=20)
+    ensemble = lt.ensemble(rigid_body(), x0s, SPAN, STEP, outputs=outputs, save_every=20)
     loaded_run = lt.load(ensemble.save(tmp_path / "deep" / "many.nc"))
     for name, value in vars(ensemble).items():
         if isinstance(value, np.ndarray):
@@ -111,7 +112,7 @@ def test_save_and_load(tmp_path, outputs):
 
 
 def test_a_damaged_file_is_refused(tmp_path):
-    path = lt.ensemble(BODY, states(3), SPAN, STEP).save(tmp_path / "many.nc")
+    path = lt.ensemble(rigid_body(), states(3), SPAN, STEP).save(tmp_path / "many.nc")
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 8
     path.write_bytes(content)
@@ -122,7 +123,7 @@ def test_a_damaged_file_is_refused(tmp_path):
 def test_xarray():
     x0s = states(4)
     x0s[1, 0] = np.inf
-    ensemble = lt.ensemble(BODY, x0s, SPAN, STEP, save_at=[1.0, 2.5])
+    ensemble = lt.ensemble(rigid_body(), x0s, SPAN, STEP, save_at=[1.0, 2.5])
     dataset = ensemble.to_xarray()
     assert dataset["x"].dims == ("trajectory", "time", "component")
     assert dataset["time"].to_numpy().tolist() == [0.0, 1.0, 2.5, 6.0]
@@ -144,7 +145,7 @@ def test_inadmissible_parameters_are_a_status_of_their_member(is_named):
 
     def run(rates, x0s):
         if is_named:
-            return lt.ensemble(BODY, x0s, SPAN, STEP, parameters={"dissipation.rate": rates}, **options)
+            return lt.ensemble(rigid_body(), x0s, SPAN, STEP, parameters={"dissipation.rate": rates}, **options)
         return lt.ensemble(lambda rate: lt.models.rigid_body(rate=rate), x0s, SPAN, STEP, parameters=rates, **options)
 
     many, good = run(rates, states(1000)), np.delete(np.arange(1000), [17, 400, 999])
@@ -164,16 +165,16 @@ def test_inadmissible_parameters_are_a_status_of_their_member(is_named):
 
 def test_half_of_them_inadmissible():
     rates = np.linspace(-1.0, 1.0, 20)
-    ensemble = lt.ensemble(BODY, [0.1, 1.0, 0.2], SPAN, STEP, parameters={"dissipation.rate": rates})
+    ensemble = lt.ensemble(rigid_body(), [0.1, 1.0, 0.2], SPAN, STEP, parameters={"dissipation.rate": rates})
     assert np.array_equal(ensemble.ok, rates >= 0.0)
 
 
 def test_states_that_are_none_stay_where_they_are():
     x0s = states(50)
     x0s[[3, 4, 49], 1] = np.nan, np.inf, -np.inf
-    ensemble, rest = lt.ensemble(BODY, x0s, SPAN, STEP), np.delete(np.arange(50), [3, 4, 49])
+    ensemble, rest = lt.ensemble(rigid_body(), x0s, SPAN, STEP), np.delete(np.arange(50), [3, 4, 49])
     assert np.flatnonzero(~ensemble.ok).tolist() == [3, 4, 49]
-    assert np.array_equal(ensemble.x[rest], lt.ensemble(BODY, x0s[rest], SPAN, STEP).x)
+    assert np.array_equal(ensemble.x[rest], lt.ensemble(rigid_body(), x0s[rest], SPAN, STEP).x)
     assert "component" in ensemble.message(49)
 
 
@@ -184,17 +185,17 @@ def test_states_that_are_none_stay_where_they_are():
 def test_save_at(engine):
     """Members take the steps of single runs, and save the same states."""
     times, x0s = [0.37, 1.0, 1.05, 3.3], states(9)
-    ensemble = lt.ensemble(BODY, x0s, SPAN, STEP, save_at=times, engine=engine)
+    ensemble = lt.ensemble(rigid_body(), x0s, SPAN, STEP, save_at=times, engine=engine)
     assert ensemble.t.tolist() == [0.0, *times, 6.0]
     for i in (0, 8):
-        one = lt.integrate(BODY, x0s[i], SPAN, STEP, save_at=times, engine=engine)
+        one = lt.integrate(rigid_body(), x0s[i], SPAN, STEP, save_at=times, engine=engine)
         assert np.abs(ensemble.x[i] - one.x).max() < 1e-14
         assert ensemble.steps[i] == one.stats.steps
     assert ensemble.audit().passed
 
 
 def test_progress(capfd):
-    lt.ensemble(BODY, states(20), SPAN, STEP, progress=True)
+    lt.ensemble(rigid_body(), states(20), SPAN, STEP, progress=True)
     assert "20 trajectories" in capfd.readouterr().err
-    lt.ensemble(BODY, states(20), SPAN, STEP, progress=False)
+    lt.ensemble(rigid_body(), states(20), SPAN, STEP, progress=False)
     assert capfd.readouterr().err == ""

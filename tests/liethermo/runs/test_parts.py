@@ -11,6 +11,7 @@ import manifolds as mf
 from liethermo.runs.noise import step_code, step_time_codes
 from liethermo.runs.schedule import ScheduleSegment
 from tests.cases import BuiltOnUse
+from tests.systems import oscillator
 
 ENTROPY = lt.Quadratic(4.0 * np.ones(3))
 ENERGY = lt.Quadratic([1 / 3, 1 / 2, 1.0])
@@ -56,6 +57,7 @@ NOISY = BuiltOnUse(
 )  # fmt: skip
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("engine", ["compiled", pytest.param("array", marks=ARRAY)])
 @pytest.mark.parametrize("name", NOISY)
 def test_a_noisy_run_in_parts_is_the_run_to_the_bit(name, engine):
@@ -152,6 +154,7 @@ def test_a_loop_of_short_noisy_runs_has_the_mean_of_equilibrium():
     assert np.array_equal(whole_run.x[1:, 2], s3)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["body", "spin", "bath"])
 def test_energy_and_casimirs_of_noisy_runs_do_not_drift(name):
     """Though no step hands on what rounding has kept: over 1e5 steps they stay within a few roundings."""
@@ -341,6 +344,7 @@ def test_a_run_in_parts_is_the_run_to_rounding(name):
     assert distance > 1e-2 if system.is_driven else distance < 1e-12  # the control: times are absolute
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ["body, Gauss", "attitude, Runge-Kutta", "bath", "torque, Gauss"])
 def test_a_run_goes_on_from_a_file(name, tmp_path):
     """States, times and attitudes of a file are those of the run, so what goes on from them is, to the bit."""
@@ -389,9 +393,7 @@ def test_adaptive_steps_that_end_where_parts_do_are_those_of_parts():
         assert np.abs(part.x[-1] - whole_run.x[np.searchsorted(whole_run.t, TIMES[i])]).max() < 1e-6
 
 
-OSCILLATOR = lt.MetriplecticSystem(mf.Canonical(1), lambda z: 0.5 * jnp.dot(z, z))
-
-
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-10)], ids=["fixed", "adaptive"])
 @pytest.mark.parametrize("cut_time", [0.3, 1.5, 1.57, 1.5707, 1.6, 4.7, 5.0])
 def test_events_of_a_run_in_parts_are_those_of_the_run(step, cut_time):
@@ -399,13 +401,13 @@ def test_events_of_a_run_in_parts_are_those_of_the_run(step, cut_time):
     events, x, t = [], [1.0, 0.0], 0.0
     for end in (cut_time, 9.0):
         while t < end:
-            run = lt.integrate(OSCILLATOR, x, (t, end), step, lt.MetriplecticGauss(4), until=lambda z: z[0])
+            run = lt.integrate(oscillator(), x, (t, end), step, lt.MetriplecticGauss(4), until=lambda z: z[0])
             x, t = run.x[-1], run.t[-1]
             if run.event_time is not None:
                 events.append(run.event_time)
                 tolerance = min(1e-3, end - t)  # off the event: by a step without one
                 if tolerance > 0.0:
-                    rest = lt.integrate(OSCILLATOR, x, (t, t + tolerance), tolerance, lt.MetriplecticGauss(4))
+                    rest = lt.integrate(oscillator(), x, (t, t + tolerance), tolerance, lt.MetriplecticGauss(4))
                     x, t = rest.x[-1], rest.t[-1]
     assert np.allclose(events, np.pi * np.array([0.5, 1.5, 2.5]), rtol=0.0, atol=2e-8)
 

@@ -13,11 +13,12 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.engines.select_engine import EngineWithFallback
 from liethermo.integrators import reference
+from tests.systems import rigid_body
 
-BODY = lt.models.rigid_body()
 X0 = np.array([0.1, 1.0, 0.1])
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("error", "why"),
     [
@@ -37,12 +38,12 @@ def test_fixed_steps(monkeypatch, error, why):
 
     monkeypatch.setattr(EngineWithFallback, "advance_trajectory", fail_third_advance)
     monkeypatch.setattr(EngineWithFallback, "max_saves_per_call", property(lambda self: 10))
-    whole_run = lt.integrate(BODY, X0, (0.0, 5.0), 0.1, engine="array")
+    whole_run = lt.integrate(rigid_body(), X0, (0.0, 5.0), 0.1, engine="array")
     assert whole_run.status.code == "interrupted"
     assert why in whole_run.status.message
     assert len(whole_run.t) == len(whole_run.x) == len(whole_run.energy) == 21
     monkeypatch.undo()
-    assert np.array_equal(lt.integrate(BODY, X0, (0.0, 2.0), 0.1, engine="array").x, whole_run.x)
+    assert np.array_equal(lt.integrate(rigid_body(), X0, (0.0, 2.0), 0.1, engine="array").x, whole_run.x)
 
 
 def test_adaptive_steps(monkeypatch):
@@ -57,7 +58,7 @@ def test_adaptive_steps(monkeypatch):
         return append(self, *arguments)
 
     monkeypatch.setattr(Run, "_save_steps", fail_second_append)
-    solution = lt.integrate(BODY, X0, (0.0, 500.0), lt.Adaptive(1e-9))
+    solution = lt.integrate(rigid_body(), X0, (0.0, 500.0), lt.Adaptive(1e-9))
     assert "no memory left" in solution.status.message
     assert 1 < len(solution.t) == len(solution.x) == len(solution.energy)
 
@@ -68,7 +69,7 @@ def test_another_error_is_not_hidden(monkeypatch):
 
     monkeypatch.setattr(EngineWithFallback, "advance_trajectory", raise_unknown_error)
     with pytest.raises(jax.errors.JaxRuntimeError, match="something else"):
-        lt.integrate(BODY, X0, (0.0, 5.0), 0.1)
+        lt.integrate(rigid_body(), X0, (0.0, 5.0), 0.1)
 
 
 def test_the_reference_solver(monkeypatch):
@@ -81,12 +82,12 @@ def test_the_reference_solver(monkeypatch):
         return field(*arguments)
 
     monkeypatch.setattr(reference, "_vector_field", interrupt_field)
-    solution = lt.integrate(BODY, X0, (0.0, 50.0), 0.1, lt.Reference(1e-9))
+    solution = lt.integrate(rigid_body(), X0, (0.0, 50.0), 0.1, lt.Reference(1e-9))
     assert solution.status.code == "interrupted"
     assert "stopped by the user after t =" in solution.status.message
     assert 2 < len(solution.t) == len(solution.x) < 501
     monkeypatch.undo()
-    whole_run = lt.integrate(BODY, X0, (0.0, 50.0), 0.1, lt.Reference(1e-9))
+    whole_run = lt.integrate(rigid_body(), X0, (0.0, 50.0), 0.1, lt.Reference(1e-9))
     assert np.array_equal(whole_run.x[: len(solution.x)], solution.x)
 
 

@@ -74,6 +74,7 @@ def rename_measure(name):
     def change(group):
         attributes, arrays = group["attributes"], group["consolidated_metadata"]["metadata"]
         arrays[name] = arrays.pop("end")
+        arrays[name]["dimension_names"][-1] = f"{name}_component"
         attributes["measures"] = [name, "tau"]
         description = attributes["study"]
         for key in ("measures", "values"):

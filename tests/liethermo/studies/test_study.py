@@ -200,7 +200,6 @@ def test_a_builder_that_looks_at_values_is_called_for_each_point(tmp_path):
     np.testing.assert_allclose(results.final.sel(kind="plate", rate=0.5), direct.x[-1], rtol=0, atol=1e-14)
 
 
-@pytest.mark.slow
 def test_failures_broken_laws_and_measures_that_raise_are_statuses(tmp_path):
     def gains(p):  # a friction whose sign the library is not told
         energy = lt.Quadratic([1.0, 0.5, 0.25])

@@ -6,6 +6,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import liethermo as lt
+from tests.refusals import refusal_test
 
 FIELD = 1.2
 RATE = 0.3
@@ -25,6 +26,7 @@ def motion(t, u):
     return [*(torque + RATE * np.cross(s, torque)), heat / (1.0 + 0.5 * np.sin(t)), u[3] * 0.5 * np.cos(t)]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4)])
 def test_a_bath_with_a_given_temperature_does_its_work(method):
     reference = solve_ivp(motion, (0.0, 6.0), [*START, 0.0, 0.0], rtol=1e-11, atol=1e-12).y[:, -1]
@@ -120,8 +122,4 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_bad_baths_are_refused(name):
-    attempt, says = BAD[name]
-    with pytest.raises((lt.InputError, lt.FunctionError), match=says):
-        attempt()
+test_bad_baths_are_refused = refusal_test(BAD, error=(lt.InputError, lt.FunctionError))

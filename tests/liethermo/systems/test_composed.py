@@ -15,6 +15,7 @@ import manifolds as mf
 from liethermo.dissipation.bodies import HeatConduction
 from liethermo.functions.edges import Edges
 from tests.cases import tolerance
+from tests.refusals import refusal_test
 
 seeds = st.integers(0, 10**6)
 
@@ -280,25 +281,20 @@ def test_unusable_couplings(arguments, words):
         lt.ComposedSystem(bodies, **arguments)
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: lt.Subsystem(lambda x: x[0], 2), "2n \\+ 1, and 1 for S alone"),
-        (lambda: lt.Subsystem(Warm(jnp.asarray(1.0)), 1, friction=1.0), "no momenta"),
-        (lambda: lt.Subsystem(CART.energy, 3, friction=-1.0), ">= 0, not -1"),
-        (lambda: lt.Subsystem(CART.energy, 3, friction=[1.0, 2.0]), "shape"),
-        (lambda: lt.Subsystem(CART.energy, 3, friction="dry"), "'contact', not 'dry'"),
-        (
-            lambda: lt.Subsystem(CART.energy, 3, friction=lambda x: x),
-            r"must have shape \(\) or \(1,\) or \(1, 1\), got \(3,\)",
-        ),
-        (lambda: lt.ComposedSystem([CART, CART.energy]), "must be an lt.Subsystem"),
-        (lambda: lt.ComposedSystem([]), "at least one"),
-    ],
+test_unusable_subsystems = refusal_test(
+    (lambda: lt.Subsystem(lambda x: x[0], 2), "2n \\+ 1, and 1 for S alone"),
+    (lambda: lt.Subsystem(Warm(jnp.asarray(1.0)), 1, friction=1.0), "no momenta"),
+    (lambda: lt.Subsystem(CART.energy, 3, friction=-1.0), ">= 0, not -1"),
+    (lambda: lt.Subsystem(CART.energy, 3, friction=[1.0, 2.0]), "shape"),
+    (lambda: lt.Subsystem(CART.energy, 3, friction="dry"), "'contact', not 'dry'"),
+    (
+        lambda: lt.Subsystem(CART.energy, 3, friction=lambda x: x),
+        r"must have shape \(\) or \(1,\) or \(1, 1\), got \(3,\)",
+    ),
+    (lambda: lt.ComposedSystem([CART, CART.energy]), "must be an lt.Subsystem"),
+    (lambda: lt.ComposedSystem([]), "at least one"),
+    error=(lt.InputError, lt.FunctionError),
 )
-def test_unusable_subsystems(make, words):
-    with pytest.raises((lt.InputError, lt.FunctionError), match=words):
-        make()
 
 
 @pytest.mark.slow

@@ -11,8 +11,9 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.systems.driven import CLOCK_UNIT
+from liethermo.systems.driven import CLOCK_UNIT, DrivenSystem
 from liethermo.tracing.interpret import evaluate_at_points
+from tests.refusals import refusal_test
 
 RATE = 1.3
 SPAN = (0.5, 3.5)
@@ -159,7 +160,7 @@ def _slopes(model, z):
 def slopes(system, method, states, rates):
     """At some states, shape (m, n), with slopes, shape (m, stages, n), in a driven system with ``t' = 1``."""
     if system.is_driven:
-        system = lt.DrivenSystem(system)
+        system = DrivenSystem(system)
         states = system.initial_state(states, 0.5, batch=True)
         rates = np.concatenate([rates, np.full((*rates.shape[:-1], 2), system.unit)], axis=-1)
     return evaluate_at_points(
@@ -328,7 +329,7 @@ def test_the_axioms_are_tested_at_random_times():
 
 
 def test_a_driven_system_is_the_same_when_taken_apart():
-    driven = lt.DrivenSystem(SPIN)
+    driven = DrivenSystem(SPIN)
     leaves, structure = jax.tree_util.tree_flatten(driven)
     again = jax.tree_util.tree_unflatten(structure, leaves)
     y = driven.initial_state(SPIN_START, 0.9)
@@ -388,7 +389,7 @@ def test_an_euler_poincare_system_with_changing_inertia():
     mu, t = jnp.asarray(SPIN_START), 0.9
     assert np.allclose(by_velocity.velocity(mu, t), mu / growing_inertia(t), rtol=1e-14)
     assert np.allclose(by_velocity.momentum(mu / growing_inertia(t), t), mu, rtol=1e-14)
-    fields = [lt.DrivenSystem(s, unit=1.0) for s in (by_velocity, by_momentum)]
+    fields = [DrivenSystem(s, unit=1.0) for s in (by_velocity, by_momentum)]
     found = [s.vector_field(s.initial_state(mu, t)) for s in fields]
     assert np.allclose(*found, rtol=1e-12, atol=1e-14)
     assert not by_velocity.can_unroll
@@ -436,30 +437,25 @@ def test_functions_held_by_the_method_and_stiff_steps():
         assert run.audit(energy=1e-12).passed, run.audit()
 
 
-@pytest.mark.parametrize(
-    ("build", "words"),
-    [
-        (
-            lambda: lt.MetriplecticSystem(None, still, lambda x, t: t * x[0], dim=2),
-            "the entropy must be a function of the state alone",
-        ),
-        (
-            lambda: lt.MetriplecticSystem(None, still, momentum_maps={"J": shaken}, dim=2),
-            "momentum map 'J' must be a function of the state alone",
-        ),
-        (lambda: lt.MetriplecticSystem(None, lambda x, t: t * x, dim=2), r"shape \(2,\)"),
-        (lambda: lt.MetriplecticSystem(None, lt.TimeDependent(lambda x, t: x[7] * t).on([7]), dim=2), "component 7"),
-        (
-            lambda: lt.ThermodynamicHerglotz(lambda x, t: x[1] ** 2 - x[0] * t, dim=3),
-            "the Lagrangian must be a function of the state alone",
-        ),
-        (lambda: lt.SimpleClosedSystem(lambda q, v, S, t: v @ v - S * t, dim=3), "external"),
-        (lambda: lt.Subsystem(shaken, 3), "the energy of a subsystem must be a function of the state alone"),
-        (lambda: SHAKEN.energy(np.ones(2)), r"energy\(x, t\)"),
-        (lambda: lt.integrate(SHAKEN, [1.0, 0.0], SPAN, 0.1, lt.VariationalGauss(2)), "Metriplectic.* depends on time"),
-        (lambda: lt.integrate(SHAKEN, [1.0, 0.0, 0.5], SPAN, 0.1), r"shape \(2,\)"),
-    ],
+test_what_is_refused = refusal_test(
+    (
+        lambda: lt.MetriplecticSystem(None, still, lambda x, t: t * x[0], dim=2),
+        "the entropy must be a function of the state alone",
+    ),
+    (
+        lambda: lt.MetriplecticSystem(None, still, momentum_maps={"J": shaken}, dim=2),
+        "momentum map 'J' must be a function of the state alone",
+    ),
+    (lambda: lt.MetriplecticSystem(None, lambda x, t: t * x, dim=2), r"shape \(2,\)"),
+    (lambda: lt.MetriplecticSystem(None, lt.TimeDependent(lambda x, t: x[7] * t).on([7]), dim=2), "component 7"),
+    (
+        lambda: lt.ThermodynamicHerglotz(lambda x, t: x[1] ** 2 - x[0] * t, dim=3),
+        "the Lagrangian must be a function of the state alone",
+    ),
+    (lambda: lt.SimpleClosedSystem(lambda q, v, S, t: v @ v - S * t, dim=3), "external"),
+    (lambda: lt.Subsystem(shaken, 3), "the energy of a subsystem must be a function of the state alone"),
+    (lambda: SHAKEN.energy(np.ones(2)), r"energy\(x, t\)"),
+    (lambda: lt.integrate(SHAKEN, [1.0, 0.0], SPAN, 0.1, lt.VariationalGauss(2)), "Metriplectic.* depends on time"),
+    (lambda: lt.integrate(SHAKEN, [1.0, 0.0, 0.5], SPAN, 0.1), r"shape \(2,\)"),
+    error=(lt.InputError, lt.FunctionError),
 )
-def test_what_is_refused(build, words):
-    with pytest.raises((lt.InputError, lt.FunctionError), match=words):
-        build()

@@ -178,7 +178,7 @@ def solve_by_scipy(rho, capacity, t):
     return (y[:4] + 1j * y[4:8]).reshape(2, 2), y[8]
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", METHODS)
 def test_orders(name):
     """With a bath of finite heat capacity, so that nothing is linear, beside SciPy."""
@@ -240,7 +240,7 @@ SYSTEM_METHOD_PAIRS = [
 ]
 
 
-@pytest.mark.sampled("a finite bath-Taylor", "dephasing-midpoint", "unital noise-explicit")
+@pytest.mark.sampled("a finite bath-Taylor", "unital noise-explicit")
 @pytest.mark.parametrize(("name", "by"), SYSTEM_METHOD_PAIRS)
 def test_every_dissipation_keeps_its_laws_by_every_method(name, by):
     """From random states; and from one next to a pure state, at which steps may be refused."""
@@ -327,6 +327,7 @@ def test_noise_without_a_bath():
     assert np.abs(motion(turning, RHO) - lindblad(RHO, QUBIT, [(X, 0.3)])).max() <= 1e-15
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "method", [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(1), lt.MetriplecticGauss(2)], ids=str
 )
@@ -782,7 +783,7 @@ def test_a_bath_takes_the_heat_of_a_small_gap_between_large_energies():
     assert ends[1] == pytest.approx(ends[0], rel=1e-12)
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("shift", [1e6, 1e10, 1e13])
 @pytest.mark.parametrize("kind", ["isolated", "noise", "bath", "driven", "terms", "steepest ascent"])
 def test_a_constant_added_to_the_hamiltonian_changes_no_state(kind, shift):

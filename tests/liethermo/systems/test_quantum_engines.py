@@ -37,6 +37,7 @@ def maser(hot, cold, drive):
     return lt.QuantumSystem(H, list(jumps)), jumps
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("drive", [2e-3, 0.1])
 @pytest.mark.parametrize("hot", [1.0, 5.0])
 def test_a_maser_has_the_efficiency_of_its_frequencies(drive, hot):
@@ -99,6 +100,7 @@ def global_system(frequencies, temperatures, g):
     return lt.QuantumSystem(pair_hamiltonian(frequencies, g), jumps, baths=baths, parts=(2, 2))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("g", [0.1, 0.01, 0.001])
 def test_the_local_current_is_that_of_its_equations(g):
     """Populations and coherence close: ``I = 4 g^2 G1 G2 (f1 - f2) / ((G1 + G2) (4 g^2 + G1 G2))`` quanta."""
@@ -109,6 +111,7 @@ def test_the_local_current_is_that_of_its_equations(g):
     np.testing.assert_allclose(local_current((1.0, 1.0), T, g), expected, rtol=1e-9)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("g", [0.1, 0.001])
 def test_the_global_current_is_that_of_two_modes(g):
     """Each mode of frequency ``1 +- g`` couples with half of its weight to either bath; no trace of g is left."""

@@ -41,6 +41,7 @@ def trace(function):
     return jax.make_jaxpr(function)(jax.ShapeDtypeStruct((4, 3), np.float64))
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", POLYNOMIALS)
 def test_array_degrees_equal_those_of_the_unrolled_program(name):
     function, expected = POLYNOMIALS[name]

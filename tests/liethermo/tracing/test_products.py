@@ -29,6 +29,7 @@ def _products(program):
     return products + [product for p in inner_programs if p is not None for product in _products(p)]
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("f", "arrays", "count"),
     [

@@ -15,8 +15,8 @@ import manifolds as mf
 from manifolds.algebras import _null_space as linear
 from manifolds.algebras import polynomial_casimirs as module
 from manifolds.algebras.polynomial import Polynomial
+from tests.cases import ALGEBRAS
 
-ALGEBRAS = list(mf.registered())
 INVARIANCE_TOLERANCE = 1e-15
 """Largest |ad*_{grad F} mu| / (|grad F| |mu|) of a Casimir; the largest measured is 2e-16 (sl(3) and su(4), degree
 3)."""

@@ -9,19 +9,20 @@ import pytest
 
 import manifolds as mf
 from manifolds import testing
+from tests.cases import ALGEBRAS
 
 
 def params_by_name(objects):
     return [pytest.param(thing, id=thing.name) for thing in objects]
 
 
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize("g", params_by_name(mf.registered()))
+@pytest.mark.sampled(18)
+@pytest.mark.parametrize("g", params_by_name(ALGEBRAS))
 def test_algebras(g):
     assert testing.check_algebra(g, degree=2).passed
 
 
-@pytest.mark.sampled("SO(3)")
+@pytest.mark.sampled("SO(3)", "SL(2)")
 @pytest.mark.parametrize("G", params_by_name(mf.registered_groups()))
 def test_groups(G):
     assert testing.check_group(G).passed

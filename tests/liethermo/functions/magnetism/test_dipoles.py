@@ -179,6 +179,7 @@ def test_periodic_energies_are_sums_over_images(periodic):
         assert float(twice(copies)) == pytest.approx(2.0 * float(energy(s)), rel=1e-13)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("few", [True, False])
 def test_dipoles_keep_both_laws(few):
     crystal = mag.lattice("square", (4, 4), periodic=(True, False))

@@ -90,6 +90,10 @@ def test_antisymmetric_bonds_have_one_direction():
         mag.dzyaloshinskii_moriya((2, 5), (0.0, 0.0, 1.0))
     assert mag.dzyaloshinskii_moriya((2, 5), (0.0, 0.0, 1.0), images=True).is_quadratic
     assert mag.dzyaloshinskii_moriya((2, 5), (0.0, 0.0, 1.0), periodic=(False, True)).is_quadratic
+    x_then_y, D = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0]), (0.3, -0.2, 0.7)  # D . (s_1 x s_2) is the third component
+    bond = mag.lattice("chain", 2, periodic=False)
+    for energy in (mag.dzyaloshinskii_moriya(bond, D), mag.dzyaloshinskii_moriya(2, D, periodic=False)):
+        assert float(energy(x_then_y)) == pytest.approx(0.7, rel=1e-15)
 
 
 def test_bonds_by_offset_and_by_distance():

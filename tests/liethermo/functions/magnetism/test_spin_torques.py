@@ -9,6 +9,7 @@ mag = lt.magnetism
 METHODS = [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4)]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_a_spin_in_a_current_has_its_closed_form_and_its_work(method):
     """``z' = (rate B - a) (1 - z^2)``; work is the gain of energy and heat, to rounding."""

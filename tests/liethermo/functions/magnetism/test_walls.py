@@ -59,6 +59,7 @@ def mobility() -> float:
     return lt.magnetism.units("SI").gamma() / ALPHA
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("share", [0.5, 0.95])
 @pytest.mark.parametrize(("edge", "rtol"), [(2e-9, 0.025), pytest.param(1e-9, 0.006, marks=pytest.mark.slow)])
 def test_a_wall_below_walkers_field_moves_at_its_velocity(share, edge, rtol):

@@ -1,0 +1,67 @@
+"""The members of classes that users call: what ``help()`` and the reference show.
+
+A class shows the members that :data:`CLASS_MEMBERS` names for it and for its base classes. One that has no entry, and
+no base class with one, shows every public member.
+"""
+
+from __future__ import annotations
+
+CLASS_MEMBERS: dict[str, tuple[str, ...]] = {
+    name: tuple(members.split())
+    for name, members in {
+        "Space": """
+            point random belongs project residual random_tangent project_tangent inner norm flat sharp exp log distance
+            squared_distance midpoint transport frame coordinates from_coordinates to_vector from_vector
+            """,
+        "Flag": "projectors",
+        "Grassmann": "subspace",
+        "GroupSpace": "velocity from_velocity",
+        "LevelSet": "geodesic",
+        "Product": "split join",
+        "TangentBundle": "tangential_part",
+        "PoissonStructure": "tensor sharp bracket hamiltonian_vector_field jacobi_residual rank",
+        "DensityMatrices": "matrix vector",
+        "ExtendedPhaseSpace": "state_indices particle_indices",
+        "Spins": "spins",
+        "ContactStructure": """
+            form differential volume flat sharp reeb horizontal bivector cartan_bracket jacobi_bracket
+            evolution_vector_field hamiltonian_vector_field
+            """,
+        "SplitContact": "liouville cosymplectic_bracket liouville_bracket",
+        "LagrangianContact": "momentum rates legendre hessian energy",
+        "LieAlgebra": """
+            from_brackets from_structure_constants from_matrices bracket ad ad_star hat vee casimirs casimir_count
+            killing_form killing_signature killing_inner_product cartan_involution is_abelian is_semisimple is_solvable
+            is_nilpotent is_unimodular is_compact_type derived_series lower_central_series isomorphism_type
+            change_of_basis with_basis_names with_invariants poisson_tensor
+            """,
+        "StructureMethods": """
+            centre derived_ideals lower_central_ideals derivations radical nilradical levi_decomposition index
+            orbit_dimension
+            """,
+        "DirectSum": "split",
+        "MagneticExtension": "halves",
+        "MatrixAlgebra": "dual_matrix from_dual_matrix",
+        "MatrixGroup": """
+            from_equations compose inverse identity belongs random exp log cayley inverse_cayley Ad Ad_star
+            """,
+    }.items()
+}
+"""Members that users call, by the name of the class that defines or first needs them; other packages add theirs."""
+
+
+def listed_names(cls: type) -> list[str]:
+    """Return the public names of a class that users call, in alphabetical order, without those of its base classes."""
+    names, has_entry = dict[str, None](), False
+    for base in cls.__mro__:
+        package = base.__module__.partition(".")[0]
+        if package in LIBRARY_PACKAGES and base.__qualname__ in CLASS_MEMBERS:
+            has_entry = True
+            names |= dict.fromkeys(CLASS_MEMBERS[base.__qualname__])
+        elif package not in (*LIBRARY_PACKAGES, "equinox", "builtins", "collections"):
+            names |= dict.fromkeys(name for name in vars(base) if not name.startswith("_"))
+    return sorted(name for name in names if hasattr(cls, name)) if has_entry else list(type.__dir__(cls))
+
+
+LIBRARY_PACKAGES = {"manifolds"}
+"""Packages whose classes show the members that :data:`CLASS_MEMBERS` names."""
