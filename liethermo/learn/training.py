@@ -560,12 +560,12 @@ def read_archive(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.nd
     try:
         content = path.read_bytes()
         if not content.startswith(b"PK"):
-            raise ValueError("it is no archive of arrays")
+            raise ValueError("it is not an archive of arrays")
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         metadata = json.loads(arrays.pop("__json__").tobytes())
         if not isinstance(metadata, dict) or metadata.get("format") != kind:
-            raise ValueError(f"it is no {kind}")
+            raise ValueError(f"it is not a {kind}")
         if metadata.pop("checksum", None) != _checksum(metadata, arrays):
             raise ValueError("its contents are not those that were written")
     except FileNotFoundError:

@@ -356,8 +356,8 @@ class Ensemble(AuditableResult):
     def to_xarray(self, units: Mapping[str, str] | None = None) -> xarray.Dataset:
         """Return an ``xarray.Dataset`` with coordinates ``trajectory`` and ``time``; all else is in attributes (JSON).
 
-        ``status_text`` and ``message`` describe the end of every trajectory. Each variable has a long name, energy and
-        entropy also the law that the system promises of them.
+        ``status_text`` and ``message`` describe the end of every trajectory. Each variable has a long name; those of
+        energy and entropy state the law that they obey.
 
         Parameters
         ----------

@@ -210,7 +210,7 @@ def _apply_change(table: dict[str, Any], change: str, problems: list[str]) -> No
     for part in parts[:-1]:
         table = table.setdefault(part, {})
         if not isinstance(table, dict):
-            problems.append(f"--set {change}: {part} is no section")
+            problems.append(f"--set {change}: {part} is not a section")
             return
     table[parts[-1]] = value
 
