@@ -1096,7 +1096,7 @@ BAD = {
     "bath 1, but there are 1": lambda q: lt.QuantumSystem(
         QUBIT, lt.ThermalJumps([(LOWER, 1.0)], bath=1), baths=infinite()
     ),
-    "leave out baths": lambda q: lt.QuantumSystem(QUBIT, baths=infinite()),
+    "or remove baths=": lambda q: lt.QuantumSystem(QUBIT, baths=infinite()),
     "lt.ThermalJumps or": lambda q: lt.QuantumSystem(QUBIT, lt.DoubleBracket(1.0)),
     r"the rate of V\[0\] is a number, or a function .* not to": lambda q: lt.ThermalJumps([(LOWER, lambda w, T: [w])]),
     "at omega = 1 and T = 1 it is -1": lambda q: lt.ThermalJumps([(LOWER, lambda w, T: -1.0)]),
