@@ -263,9 +263,7 @@ class QuantumSystem(System):
         """Return ``tr(rho A)`` of states, shape (..., n) to (...), for an observable A, Hermitian, shape (N, N)."""
         observable = checked_hermitian(observable, "the observable")
         if observable.shape != (self.structure.size,) * 2:
-            raise InputError(
-                f"the observable has shape {observable.shape}, and the state that of {self.structure.size}"
-            )
+            raise InputError(f"the observable must have shape {(self.structure.size,) * 2}, got {observable.shape}")
         return jnp.asarray(x)[..., : self.body_dim] @ self.structure.vector(observable)
 
     def bloch(self, x, part: int | str = 0) -> jax.Array:
