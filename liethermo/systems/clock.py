@@ -19,7 +19,7 @@ WORK_NAME = "work"
 
 
 class Clock(Module):
-    """Where a state contains the time and the work, and the span of the run, at whose breaks functions of time jump.
+    """Index of the time in a state, which the work follows, and the span of the run, at whose breaks functions jump.
 
     Attributes
     ----------
