@@ -77,7 +77,8 @@ def test_the_page_of_a_lie_poisson_system_shows_what_users_call():
     shown = api_members.shown_members(liethermo.LiePoissonSystem)
     assert {"state", "vector_field", "entropy_production", "temperatures", "casimirs", "check"} <= set(shown)
     assert len(shown) <= 8
-    assert len(api_members.public_members(liethermo.LiePoissonSystem)) > 80  # what it would show without the table
+    all_members = api_members.public_members(liethermo.LiePoissonSystem)  # what it would show without the table
+    assert 5 * len(shown) < len(all_members)
 
 
 def test_the_template_lists_the_members_of_a_page():

@@ -36,7 +36,7 @@ class InvariantVerdicts(NamedTuple):
 
 
 class EngineHints(NamedTuple):
-    """What an engine and a check may rely on in a system.
+    """Properties of a system on which an engine and a check may rely.
 
     Attributes
     ----------
