@@ -15,7 +15,7 @@ import typer
 
 from manifolds import ManifoldsError
 
-from . import __version__
+from . import __version__, disk
 from . import models as catalogue
 from .errors import AxiomError, FileError, InputError, LiethermoError
 from .integrators import registered_methods
@@ -236,12 +236,9 @@ def main() -> None:
 
 def _prepare_result_folder(spec: Path, folder: Path) -> Path:
     """Create the folder of the results and copy the spec into it, so that an unwritable folder fails at once."""
-    try:
+    with disk.file_errors("write the results into", folder), contextlib.suppress(shutil.SameFileError):
         folder.mkdir(parents=True, exist_ok=True)
-        with contextlib.suppress(shutil.SameFileError):
-            shutil.copyfile(spec, folder / spec.name)
-    except OSError as error:
-        raise FileError(f"cannot write the results into {folder}: {error.strerror}") from error
+        shutil.copyfile(spec, folder / spec.name)
     return folder
 
 

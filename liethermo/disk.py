@@ -10,7 +10,10 @@ import re
 import secrets
 import socket
 import time
+from collections.abc import Iterator
 from pathlib import Path
+
+from .errors import FileError
 
 PART_SUFFIX = ".part"
 """Suffix of the name of a file that is being written."""
@@ -40,7 +43,7 @@ def write_atomically(path: Path, data: bytes | memoryview, mode: int = 0o666) ->
     """
     partial_file = path.with_name(partial_file_name(path.name))
     if path.exists() and not path.is_file():
-        raise OSError(errno.EEXIST, "what is there is no plain file")
+        raise OSError(errno.EEXIST, "what is there is not a plain file")
     try:
         try:
             handle = os.open(partial_file, EXCLUSIVE_WRITE_FLAGS, mode)
@@ -85,6 +88,27 @@ def is_abandoned(partial_file: Path) -> bool:
     except (OSError, OverflowError):  # a process of another user
         return False
     return False
+
+
+@contextlib.contextmanager
+def file_errors(action: str, path: str | os.PathLike, advice: str = "") -> Iterator[None]:
+    """Raise FileError with the path and the cause where the operating system refuses to read or write.
+
+    Parameters
+    ----------
+    action : str
+        What cannot be done with the path, such as "read".
+    path : path
+    advice : str
+        Sentence at the end of the message.
+    """
+    try:
+        yield
+    except FileError:
+        raise
+    except (OSError, ValueError) as error:  # ValueError for an invalid path
+        end = f". {advice}" if advice else ""
+        raise FileError(f"cannot {action} {path!s:.200}: {describe_os_error(error)}{end}") from error
 
 
 def describe_os_error(error: OSError | ValueError) -> str:

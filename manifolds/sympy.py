@@ -65,7 +65,7 @@ def polynomial(expression: Any, variables: Sequence[sympy.Symbol]) -> Polynomial
     Raises
     ------
     ComponentError
-        If the expression is no polynomial in the symbols with real coefficients.
+        If the expression is not a polynomial in the symbols with real coefficients.
     """
     terms: dict[tuple[int, ...], Any] = {}
     for term in sympy.Add.make_args(sympy.expand(sympy.sympify(expression))):
@@ -74,7 +74,7 @@ def polynomial(expression: Any, variables: Sequence[sympy.Symbol]) -> Polynomial
         if not set(powers_of) <= {*variables, sympy.S.One} or not all(
             e.is_Integer and e >= 0 for e in powers_of.values()
         ):
-            raise ComponentError(f"{expression} is no polynomial in {', '.join(map(str, variables))}: see {term}")
+            raise ComponentError(f"{expression} is not a polynomial in {', '.join(map(str, variables))}: see {term}")
         power = tuple(int(powers_of.get(x, 0)) for x in variables)
         terms[power] = terms.get(power, 0) + number
     powers = np.array(list(terms), dtype=np.int64).reshape(-1, len(variables))
@@ -98,7 +98,7 @@ def algebra(constants: Any, name: str = "g", basis_names: Sequence[str] | None =
     Raises
     ------
     ComponentError
-        If an entry is no real number.
+        If an entry is not a real number.
     LieAlgebraError
         If an axiom fails: see :meth:`LieAlgebra.from_structure_constants`.
     """
@@ -122,4 +122,4 @@ def _coefficient(value: Any) -> Fraction | float:
         return Fraction(int(value.p), int(value.q))
     if value.is_number and value.is_real:
         return float(value)
-    raise ComponentError(f"{value} is no real number; substitute numbers for the parameters first")
+    raise ComponentError(f"{value} is not a real number; substitute numbers for the parameters first")

@@ -90,7 +90,7 @@ def refusals(folder, *parts, changes=()):
             "study.axes: rigid_body has no parameter rat (did you mean rate?); it has inertia, rate, attitude, torque, "
             "initial",
         ),
-        ('axes."inertia[3]" = [1.0]', "study.axes: inertia[3] is no entry of inertia = [2.0, 1.5, 1.0]"),
+        ('axes."inertia[3]" = [1.0]', "study.axes: inertia[3] is not an entry of inertia = [2.0, 1.5, 1.0]"),
         ("axes.inertia = [1.0]", "study.axes: inertia = [2.0, 1.5, 1.0] is a list; an axis is one entry of it"),
         ("axes.rate = []", "study.axes.rate = []: "),
         (
@@ -143,7 +143,7 @@ def test_adaptive_steps_an_event_and_changes(folder):
         ("run.until=3.0", "run.until = 3.0: must be a section [run.until]"),
         ("run.attitude=[1.0]", "run.attitude[0] = 1.0: must be a valid array"),
         ("nonsense", "--set nonsense: must be section.key=value"),
-        ("run.step.fine=1", "--set run.step.fine=1: step is no section"),
+        ("run.step.fine=1", "--set run.step.fine=1: step is not a section"),
         ("method.name=Midpoint", 'method.name = "Midpoint": must be one of'),
     ],
 )

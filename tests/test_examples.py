@@ -44,7 +44,7 @@ def test_the_example_of_a_main_name_is_true(package, name, tmp_path, monkeypatch
 
 NAMES_WITH_EXAMPLE = [
     (package, name)
-    for package in (lt, mf)
+    for package in (lt, mf, lt.bodies, lt.learn, lt.magnetism, lt.models, lt.torques)
     for name in package.__all__
     if (package, name) not in MAIN
     and callable(thing := getattr(package, name))

@@ -37,6 +37,19 @@ class FourBracket(Dissipation):
     ------
     InputError
         If a constant tensor lacks a symmetry, which is named.
+
+    Examples
+    --------
+    >>> e = np.array(mf.so(3).structure_constants)
+    >>> tensor = 0.1 * np.einsum("ijm,klm->ijkl", e, e)
+    >>> system = lt.LiePoissonSystem(
+    ...     mf.so(3),
+    ...     lt.Quadratic([1.0, 2.0, 3.0]),
+    ...     mf.so(3).casimirs(2)[0],
+    ...     lt.FourBracket(tensor),
+    ... )
+    >>> bool(system.check().passed)
+    True
     """
 
     tensor: Callable | jax.Array

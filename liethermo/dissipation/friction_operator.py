@@ -50,6 +50,20 @@ class FrictionOperator(Dissipation):
         Accept any symmetric semidefinite K, and use its projection off grad H.
     projection : {"oblique", "orthogonal"}
         How the kernel is moved to the discrete gradient; G is the metric of the space.
+
+    Examples
+    --------
+    >>> def friction(x):
+    ...     v = jnp.array([-x[1], x[0], 0.0])  # orthogonal to grad H
+    ...     return jnp.outer(v, v)
+    >>> system = lt.LiePoissonSystem(
+    ...     mf.so(3),
+    ...     lt.Quadratic([1.0, 1.0, 0.0]),
+    ...     mf.so(3).casimirs(2)[0],
+    ...     lt.FrictionOperator(friction),
+    ... )
+    >>> bool(system.check().passed)
+    True
     """
 
     K: Callable | jax.Array

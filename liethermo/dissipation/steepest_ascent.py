@@ -37,6 +37,15 @@ class SteepestEntropyAscent(Dissipation):
         The rate gamma of the ascent (1 / time).
     preserve : list of matrices, shape (N, N), or of functions from rho, shape (N, N), to a scalar; optional
         Observables ``tr(rho A)``, or other functions, that are conserved.
+
+    Examples
+    --------
+    >>> qutrit = lt.QuantumSystem(np.diag([0.0, 1.0, 3.0]), lt.SteepestEntropyAscent(0.5))
+    >>> run = lt.integrate(qutrit, qutrit.state(np.diag([0.5, 0.2, 0.3])), (0.0, 40.0), 0.1)
+    >>> populations = np.diag(qutrit.density(run.x[-1])).real
+    >>> ratios = np.log(populations[:2] / populations[1:]) / [1.0, 2.0]
+    >>> bool(abs(ratios[0] - ratios[1]) < 1e-4)  # a Gibbs state
+    True
     """
 
     rate: jax.Array

@@ -1,7 +1,7 @@
 """Solutions of equations as differentiable functions of their parameters, to any order, in both modes.
 
-They are a primitive of their own, because ``lax.scan`` that is differentiated backwards forgets the rule of
-``jax.custom_jvp`` and ``jax.lax.custom_root`` (jax 0.10), so that the second derivative meets the loop inside.
+The solution is a primitive of its own. In jax 0.10 the reverse mode of ``lax.scan`` drops the rules of
+``jax.custom_jvp`` and ``jax.lax.custom_root``, so a second derivative would differentiate the loop of the solver.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ import manifolds as mf
 from manifolds._names import public_dir
 
 from .. import disk
-from ..errors import FileError, InputError
+from ..errors import InputError
 from ..integrators import MetriplecticGauss, Reference
 from ..runs.integrate import integrate
 from ..systems import LiePoissonSystem, System
@@ -242,10 +242,8 @@ def write(problem: dict[str, Any], path: str | os.PathLike) -> Path:
     """
     path = Path(path)
     text = json.dumps(problem, indent=2, ensure_ascii=False) + "\n"
-    try:
+    with disk.file_errors("write", path):
         disk.write_atomically(path, text.encode())
-    except (OSError, ValueError) as error:
-        raise FileError(f"cannot write {path}: {disk.describe_os_error(error)}") from error
     return path
 
 

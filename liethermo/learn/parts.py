@@ -41,6 +41,12 @@ class Energy(Function):
     ------
     InputError
         If nothing can be learned.
+
+    Examples
+    --------
+    >>> energy = lt.learn.Energy(3, width=8)
+    >>> np.shape(energy(np.array([0.1, 0.2, 0.3])))
+    ()
     """
 
     def __init__(self, function: int | Callable, width: int = 32, depth: int = 2, seed: int = 0):
@@ -177,6 +183,12 @@ class Friction(Dissipation):
         As for :class:`Energy`.
     function : function from x, shape (dim,), to the numbers of all columns, one after another; optional
         An ``equinox.Module`` in place of the network.
+
+    Examples
+    --------
+    >>> friction = lt.learn.Friction(3, rank=2, width=8)
+    >>> friction.rank
+    2
     """
 
     function: Callable

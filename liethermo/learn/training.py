@@ -545,10 +545,8 @@ def write_archive(path: Path, metadata: dict[str, Any], arrays: dict[str, Any]) 
     buffer, saved_arrays = io.BytesIO(), {name: np.asarray(values) for name, values in arrays.items()}
     text = json.dumps({**metadata, "checksum": _checksum(metadata, saved_arrays)})
     np.savez(buffer, __json__=np.frombuffer(text.encode(), dtype=np.uint8), **saved_arrays)  # type: ignore[arg-type]
-    try:
+    with disk.file_errors("write", path):
         disk.write_atomically(path, buffer.getvalue())
-    except (OSError, ValueError) as error:
-        raise FileError(f"cannot write {path!s:.200}: {disk.describe_os_error(error)}") from error
 
 
 def read_archive(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -562,12 +560,12 @@ def read_archive(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.nd
     try:
         content = path.read_bytes()
         if not content.startswith(b"PK"):
-            raise ValueError("it is no archive of arrays")
+            raise ValueError("it is not an archive of arrays")
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         metadata = json.loads(arrays.pop("__json__").tobytes())
         if not isinstance(metadata, dict) or metadata.get("format") != kind:
-            raise ValueError(f"it is no {kind}")
+            raise ValueError(f"it is not a {kind}")
         if metadata.pop("checksum", None) != _checksum(metadata, arrays):
             raise ValueError("its contents are not those that were written")
     except FileNotFoundError:

@@ -23,6 +23,12 @@ def damped_oscillator(mass: float = 1.0, stiffness: float = 1.0, friction: float
         m and k (mass; mass / time**2).
     friction : float, > 0
         gamma (1 / time).
+
+    Examples
+    --------
+    >>> oscillator = lt.models.damped_oscillator()
+    >>> oscillator.dim
+    3
     """
     m, k, gamma = (
         checked_positive(mass, "mass"),

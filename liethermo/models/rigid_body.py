@@ -80,6 +80,13 @@ def free_rigid_body(
         If true, runs follow the attitude, an element of SO(3).
     torque : torque, or a list of them; optional
         External torques (N m): see :mod:`liethermo.torques`. The body is then not free, and has no entropy.
+
+    Examples
+    --------
+    >>> body = lt.models.free_rigid_body((3.0, 2.0, 1.0))
+    >>> run = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 10.0), 0.1)
+    >>> bool(abs(run.energy - run.energy[0]).max() < 1e-14)
+    True
     """
     energy = Quadratic(inverse_inertia(checked_inertia(inertia, allow_rod=True)))
     entropy = Quadratic(np.ones(3)) if torque is None else None

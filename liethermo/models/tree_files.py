@@ -109,7 +109,7 @@ def read_urdf(source: str | os.PathLike, fixed_base: bool = False) -> list[BodyR
             if link not in links:
                 raise InputError(f"the joint {name!r} names the link {link!r}, which the file does not have")
         if child in joint_of:
-            raise InputError(f"the link {child!r} has two parents: a loop of joints is no tree")
+            raise InputError(f"the link {child!r} has two parents: a loop of joints is not a tree")
         joint_of[child] = joint
     roots = [name for name in links if name not in joint_of]
     if len(roots) != 1:
@@ -466,7 +466,7 @@ def _read_root(source: str | os.PathLike, tag: str, kind: str) -> Element:
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise InputError(f"the {kind} text is no well-formed XML: {error}") from error
+        raise InputError(f"the {kind} text is not well-formed XML: {error}") from error
     if root.tag != tag:
         raise InputError(f"a {kind} file must have the root element {tag!r}, got {root.tag!r}")
     return root

@@ -71,6 +71,12 @@ def zeitlin(N: int, decay: Literal["enstrophy", "energy"] | None = None, rate=0.
     InputError
     manifolds.SizeError
         If N is so large that a step would not fit into memory.
+
+    Examples
+    --------
+    >>> fluid = lt.models.zeitlin(8, decay="enstrophy", rate=0.1)
+    >>> fluid.dim
+    63
     """
     sphere, rate = QuantisedSphere(N), checked_rate(rate)
     if decay not in (None, "enstrophy", "energy"):

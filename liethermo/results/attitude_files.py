@@ -129,7 +129,7 @@ def read_csv(path: str | os.PathLike) -> AttitudeHistory:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise FileError(f"{path} could not be read: {error}") from error
     except ValueError as error:
-        raise FileError(f"{path} is no table of numbers with a line of names: {error}") from error
+        raise FileError(f"{path} is not a table of numbers with a line of names: {error}") from error
     if values.ndim != 2 or values.shape[1] != len(header):
         raise FileError(f"{path} must have {len(header)} numbers in each line after the names, and at least one line")
     columns = [split_label(name) for name in header]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from manifolds._tables import TableRow, Tabular
 from ..engines.status_codes import StatusCode
 from ..errors import InputError
 from ..functions.gradients import EPS
+from .rounding_scale import RoundingScale
 
 if TYPE_CHECKING:
     from .audit_evidence import Evidence
@@ -35,13 +36,6 @@ class AuditedRun(Protocol):
     def laws(self) -> Laws: ...
     @property
     def evidence(self) -> Evidence: ...
-
-
-VALUE_ROUNDING_RTOL = 8 * EPS
-"""Allowed change of a function, relative to its value, for the rounding of the value itself.
-
-The engines leave half of it uncorrected in the energy; the other half is for the values at both ends.
-"""
 
 
 @dataclass(frozen=True)
@@ -218,40 +212,6 @@ class Audit(Tabular):
         return self.rows, ("law", "measured", "allowed"), self.verdict
 
 
-@dataclass(frozen=True)
-class RoundingScale:
-    """Rounding scale of a function along a run, and the change of the function that an audit allows.
-
-    Attributes
-    ----------
-    value : float or ndarray
-        Value of the function, at the start or the largest.
-    sensitivity : float or ndarray
-    term_size : float or ndarray
-        Magnitude of the largest terms of which the value is the sum.
-    """
-
-    value: Any
-    sensitivity: Any
-    term_size: Any = 0.0
-
-    @property
-    def scale(self) -> Any:
-        """Scale relative to which changes of the function are given."""
-        magnitude = np.maximum(np.abs(self.value), self.sensitivity)
-        return np.where(magnitude > 0.0, magnitude, 1.0)
-
-    def allowed_change(self, tolerance: float) -> Any:
-        """Return the largest accepted change of the function, relative to ``scale``."""
-        scales = self.sensitivity, np.maximum(np.abs(self.value), self.term_size)
-        with np.errstate(invalid="ignore"):  # after an overflow the fraction is 1
-            fractions = (np.where(np.isinf(self.scale), 1.0, part_scale / self.scale) for part_scale in scales)
-            return sum(
-                fraction * allowed
-                for fraction, allowed in zip(fractions, (tolerance, VALUE_ROUNDING_RTOL), strict=True)
-            )
-
-
 def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
     """Audit a run: see :meth:`liethermo.Solution.audit`."""
     stats, laws, evidence, rows, energy = solution.stats, solution.laws, solution.evidence, [], solution.energy_balance
@@ -286,7 +246,7 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
         change = float(np.abs(series - series[0]).max() / rounding.scale)
         if name in laws.conserved:
             drifts.append(change)
-            rows.append(_judged_row(f"drift of {name}", change, float(rounding.allowed_change(tolerances.casimirs))))
+            rows.append(invariant_row(name, change, rounding, tolerances))
         elif name in laws.unpromised:
             rows.append(AuditRow(f"drift of {name}", change, None, None, UNPROMISED_CONSTANT_NOTE))
         else:
@@ -324,6 +284,11 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
     )
     coverage = coverage_text(evidence, stats.steps)
     return Audit(drift, min_entropy_increment, max(drifts, default=np.nan), stats.worst_residual, tuple(rows), coverage)
+
+
+def invariant_row(name: str, change: float, rounding: RoundingScale, tolerances: Tolerances) -> AuditRow:
+    """Return the row of a function that is conserved, from its largest change relative to its rounding scale."""
+    return _judged_row(f"drift of {name}", change, float(rounding.allowed_change(tolerances.casimirs)))
 
 
 def _spatial_momentum_row(change: float, laws: Laws, tolerances: Tolerances) -> AuditRow:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -24,6 +24,7 @@ from ..systems.conditions import RunCondition, worst_conditions
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.scalarize import UnsupportedPrimitive
 from .netcdf import SaveableResult
+from .rounding_scale import InvariantDrift
 from .step_sampling import StepSample, hermite_defect, sample_steps, vector_field_at
 
 MAX_SENSITIVITY_STATES = 256
@@ -94,6 +95,8 @@ class Evidence:
         step gets shorter.
     conditions : tuple of RunCondition
         Conditions beside the laws, such as the positivity of a density matrix.
+    drifts : dict of InvariantDrift
+        Of an ensemble: drifts of the conserved functions, by name, each of the trajectory where it is largest.
     """
 
     energy: float | None = None
@@ -105,6 +108,7 @@ class Evidence:
     looked: int | None = None
     inconsistency: float | None = None
     conditions: tuple[RunCondition, ...] = ()
+    drifts: Mapping[str, InvariantDrift] = field(default_factory=dict)
 
     def __post_init__(self):
         if (self.local_error is None) != (self.error_time is None):
@@ -116,16 +120,27 @@ def merge_evidence(evidence_list: Sequence[Evidence]) -> Evidence:
     names = dict.fromkeys(name for evidence in evidence_list for name in evidence.terms)
     terms = {name: max(evidence.terms.get(name, 0.0) for evidence in evidence_list) for name in names}
     conditions = worst_conditions(evidence.conditions for evidence in evidence_list)
+    drifts = largest_drifts(evidence.drifts for evidence in evidence_list)
     with_error = [evidence for evidence in evidence_list if evidence.local_error is not None]
     if not with_error:
-        return Evidence(terms=terms, conditions=conditions)
+        return Evidence(terms=terms, conditions=conditions, drifts=drifts)
     errors = [
         np.inf if evidence.local_error is None else np.nan_to_num(evidence.local_error, nan=np.inf)
         for evidence in with_error
     ]
     worst = with_error[int(np.argmax(errors))]
     n_checked = sum(evidence.looked or 0 for evidence in with_error)
-    return dataclasses.replace(worst, terms=terms, looked=n_checked, conditions=conditions)
+    return dataclasses.replace(worst, terms=terms, looked=n_checked, conditions=conditions, drifts=drifts)
+
+
+def largest_drifts(runs: Iterable[Mapping[str, InvariantDrift]]) -> dict[str, InvariantDrift]:
+    """Return the drifts of several runs, for each function the one that is largest relative to its rounding scale."""
+    largest: dict[str, InvariantDrift] = {}
+    for name, drift in (item for drifts in runs for item in drifts.items()):
+        other = largest.setdefault(name, drift)
+        if not drift.change <= other.change:
+            largest[name] = drift
+    return largest
 
 
 VELOCITY_AXES = {"angular_velocity": "axis", "joint_rates": "joint_coordinate"}
@@ -239,12 +254,12 @@ class EvidenceCollector:
         sample_indices = evenly_spaced_indices(len(self.x), MAX_SENSITIVITY_STATES)
         sampled_x = self.x[sample_indices]
         sensitivities, terms = evaluate_at_points(rounding_scales, tuple(functions), sampled_x)
-        sensitivity_by_name = dict(zip(names, _column_maxima(sensitivities), strict=True))
+        sensitivity_by_name = dict(zip(names, column_maxima(sensitivities), strict=True))
         energy, entropy = sensitivity_by_name.pop("energy"), sensitivity_by_name.pop("entropy", None)
         conditions = self.system.run_conditions(
             sampled_x, np.asarray(self.t)[sample_indices], frozenset(self.method.preserves)
         )
-        term_scales = dict(zip(names, _column_maxima(terms), strict=True))
+        term_scales = dict(zip(names, column_maxima(terms), strict=True))
         evidence = Evidence(energy, entropy, sensitivity_by_name, term_scales, conditions=conditions)
         # a short step of a stochastic method shows only its noise
         if not isinstance(self.method, OneStepMethod) or noise_dimension(self.method):
@@ -472,7 +487,8 @@ def evenly_spaced_indices(length: int, max_count: int) -> np.ndarray:
     return np.arange(length) if length <= max_count else np.arange(max_count) * (length - 1) // (max_count - 1)
 
 
-def _column_maxima(values: np.ndarray) -> list[float]:
+def column_maxima(values: np.ndarray) -> list[float]:
+    """Return the largest value of each column, NaN and infinity left out."""
     return [float(v) for v in np.nan_to_num(values, nan=0.0, posinf=0.0).max(axis=0)]
 
 

@@ -15,7 +15,16 @@ from manifolds._tables import html_grid
 
 from ..engines.status_codes import STATUS_NAMES, StatusCode
 from ..errors import InputError
-from .audit import FAILED_TRAJECTORIES_ROW, Audit, AuditRow, Tolerances, accuracy_row, condition_rows, coverage_text
+from .audit import (
+    FAILED_TRAJECTORIES_ROW,
+    Audit,
+    AuditRow,
+    Tolerances,
+    accuracy_row,
+    condition_rows,
+    coverage_text,
+    invariant_row,
+)
 from .audit_evidence import VELOCITY_AXES, AuditableResult, Evidence, copies_of_velocities, merge_evidence
 from .ensemble_laws import evaluate_ensemble_laws
 from .events import Events
@@ -307,9 +316,9 @@ class Ensemble(AuditableResult):
         """Audit the laws at every step of every trajectory; each row shows the worst trajectory.
 
         Local errors are measured along at most 32 trajectories, from their start as far as is affordable; with adaptive
-        steps, in the first step. Conditions beside the laws, such as the positivity of density matrices, are evaluated
-        at the saved states of the same trajectories, or at their ends if only these are kept. If not all steps were
-        checked, the verdict says how many.
+        steps, in the first step. Conserved functions, and conditions such as the positivity of density matrices, are
+        evaluated at the saved states of the same trajectories, at their ends if only these are kept, and not with
+        ``outputs="summary"``. If not all steps were checked, the verdict says how many.
 
         Parameters
         ----------
@@ -327,6 +336,8 @@ class Ensemble(AuditableResult):
         for law in evaluate_ensemble_laws(self, self.laws, limits, terms.get("energy", 0.0), terms.get("entropy", 0.0)):
             i = law.worst_member
             rows.append(law.audit_row(i, f"worst is trajectory {i}"))
+        drifts = self.evidence.drifts
+        rows += [invariant_row(name, drift.change, drift.rounding, limits) for name, drift in drifts.items()]
         rows += condition_rows(self.evidence)
         if self.evidence_source is not None or self.evidence.local_error is not None:
             rows.append(accuracy_row(self.evidence, limits))
@@ -337,15 +348,16 @@ class Ensemble(AuditableResult):
         )
         drift, residual = (float(a.max(initial=0.0, where=has_stepped)) for a in (self.energy_drift, self.residual))
         coverage = coverage_text(self.evidence, int(self.steps.sum()))
-        return Audit(drift, min_entropy_increment, np.nan, residual, tuple(rows), coverage)
+        casimir_drift = max((drift.change for drift in drifts.values()), default=np.nan)
+        return Audit(drift, min_entropy_increment, casimir_drift, residual, tuple(rows), coverage)
 
     # -- files --------------------------------------------------------------------------------------------------------
 
     def to_xarray(self, units: Mapping[str, str] | None = None) -> xarray.Dataset:
         """Return an ``xarray.Dataset`` with coordinates ``trajectory`` and ``time``; all else is in attributes (JSON).
 
-        ``status_text`` and ``message`` describe the end of every trajectory. Each variable has a long name, energy and
-        entropy also the law that the system promises of them.
+        ``status_text`` and ``message`` describe the end of every trajectory. Each variable has a long name; those of
+        energy and entropy state the law that they obey.
 
         Parameters
         ----------

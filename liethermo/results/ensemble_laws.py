@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from .audit import AuditRow, RoundingScale, Tolerances
+from .audit import AuditRow, Tolerances
+from .rounding_scale import RoundingScale
 from .status import Laws
 
 

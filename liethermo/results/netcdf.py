@@ -161,12 +161,8 @@ def write_dataset(dataset: xarray.Dataset, path: str | os.PathLike) -> Path:
         dataset.to_netcdf(buffer, engine="h5netcdf", encoding={name: {"fletcher32": True} for name in float_names})
     buffer.seek(0, io.SEEK_END)
     buffer.write(CHECKSUM_TAG + hashlib.sha256(buffer.getbuffer()).hexdigest().encode())
-    try:
+    with disk.file_errors("write", path, "The result in memory is unchanged"):
         disk.write_atomically(path, buffer.getbuffer())
-    except (OSError, ValueError) as error:  # ValueError for an invalid path
-        raise FileError(
-            f"cannot write {path!s:.200}: {disk.describe_os_error(error)}. The result in memory is unchanged"
-        ) from error
     disk.remove_abandoned_files(path.parent, path.name)
     return path
 
@@ -197,14 +193,10 @@ def read_dataset(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[s
         If an earlier version wrote the file, without a checksum, so that damage might not be noticed.
     """
     path = Path(path)
-    try:
+    with disk.file_errors("read", path):
         if not path.is_file():
             raise FileError(f"there is no file {path!s:.200}")
         _check_file_digest(path)
-    except OSError as error:
-        if isinstance(error, FileError):
-            raise
-        raise FileError(f"cannot read {path!s:.200}: {disk.describe_os_error(error)}") from error
     try:
         series, attributes = _read_hdf5(path)
     except Exception as error:  # HDF5's readers raise a dozen kinds of errors for a broken file

@@ -168,7 +168,7 @@ def joint_rates(solution: AuditableResult) -> dict[str, np.ndarray]:
     Raises
     ------
     InputError
-        If the system is no tree of jointed bodies, or no states were kept.
+        If the system is not a tree of jointed bodies, or no states were kept.
 
     Examples
     --------
@@ -191,7 +191,7 @@ def joint_rates(solution: AuditableResult) -> dict[str, np.ndarray]:
     if solution.x is None:
         raise InputError('no states were kept: run the ensemble with outputs="final" or "trajectory"')
     if "joint_rates" not in solution.velocity_sources:
-        raise InputError("the result has no joint rates: its system is no tree of jointed bodies")
+        raise InputError("the result has no joint rates: its system is not a tree of jointed bodies")
     rates = solution.velocity_sources["joint_rates"]()
     first = min(start for start, _ in solution.provenance["joints"].values())
     return solution.split_by_joint(rates, first)
@@ -219,6 +219,14 @@ def nutation(solution: AuditableResult, axis=None) -> np.ndarray:
     ------
     InputError
         If an axis is needed, or there is no momentum.
+
+    Examples
+    --------
+    >>> body = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.5)
+    >>> run = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 100.0), 0.1)
+    >>> angle = lt.bodies.nutation(run, axis=[1.0, 0.0, 0.0])
+    >>> bool(angle[0] > 1.0), bool(min(angle[-1], 3.1416 - angle[-1]) < 0.1)
+    (True, True)
     """
     mu, (a, b, e) = _momenta(solution), _body_frame(solution, axis)
     return np.arctan2(np.hypot(mu @ a, mu @ b), mu @ e)

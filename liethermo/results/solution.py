@@ -176,6 +176,13 @@ class Solution(AuditableResult):
         ------
         InputError
             If the name of a tolerance is unknown, or a tolerance is negative.
+
+        Examples
+        --------
+        >>> body = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.1)
+        >>> audit = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 10.0), 0.1).audit()
+        >>> audit.passed, bool(audit.energy_drift < 1e-13)
+        (True, True)
         """
         return audit_run(self, Tolerances.with_defaults(**tolerances))
 
@@ -186,7 +193,7 @@ class Solution(AuditableResult):
     def to_xarray(self, units: Mapping[str, str] | None = None) -> xarray.Dataset:
         """Return an ``xarray.Dataset`` with coordinate ``time`` and all series; the rest is in attributes (JSON).
 
-        Each variable has a long name, energy and entropy also the law that the system promises of them. A body with
+        Each variable has a long name; those of energy and entropy state the law that they obey. A body with
         attitudes has its ``quaternion``, ``nutation``, ``precession`` and ``spin`` too [:mod:`liethermo.bodies`], and
         every rigid body its ``angular_velocity`` in body axes; the attribute ``comment`` states the convention.
 

@@ -223,7 +223,7 @@ class _BatchRecorder:
             self.initial = {name: values[running] for name, values in self.initial.items()}
 
     def record_interrupted(self) -> None:
-        """Record the trajectories that go on, as interrupted."""
+        """Record the unfinished trajectories as interrupted."""
         indices = np.flatnonzero(self.is_running)
         if indices.size:
             self._finish(indices, np.full(indices.size, StatusCode.INTERRUPTED))

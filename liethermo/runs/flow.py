@@ -212,7 +212,8 @@ def _check_arguments(system, t_span, step, method) -> None:
     if is_traced(t_span, step):
         raise InputError(
             "t_span and step must be numbers, got traced values. The derivative by the end time is system.vector_field "
-            "at the end; for other times multiply the energy and the rates by a factor"
+            "at the end. For derivatives by other times, integrate to t = 1 and multiply the energy and the rates by a "
+            "traced duration"
         )
 
 

@@ -54,7 +54,7 @@ def checked_save_times(save_at, schedule: StepSchedule) -> jax.Array | np.ndarra
 def states_at_times(
     system: System, method: OneStepMethod, path, grid, times, span: tuple[float, float], step: Callable
 ) -> jax.Array:
-    """Return the states at times, shape (times, n): each a step of the method from the last state of the path before.
+    """Return the states at times, shape (times, n), each by one step from the last state of the path before its time.
 
     Parameters
     ----------

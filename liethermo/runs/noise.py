@@ -64,6 +64,16 @@ class Fluctuations:
         The equilibrium measure is its product with the measure above.
     first : int, >= 0
         Number of the first trajectory: ``first=i`` of a single run is trajectory i of an ensemble.
+
+    Examples
+    --------
+    >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.5)
+    >>> noise = lt.Fluctuations(boltzmann=0.1, seed=1)
+    >>> run = lt.integrate(
+    ...     body, [0.5, 0.5, 1.0], (0.0, 10.0), 0.05, lt.MetriplecticMidpoint(), noise=noise
+    ... )
+    >>> bool(abs(run.energy - run.energy[0]).max() < 1e-12)
+    True
     """
 
     boltzmann: float = 1.0

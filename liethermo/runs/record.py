@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from ..engines.adaptive_runs import EventOccurrence
@@ -14,8 +15,8 @@ from ..engines.compiled.parameters import ProgramStructure
 from ..engines.select_engine import EngineWithFallback
 from ..engines.status_codes import StatusCode
 from ..engines.step import energy_or_entropy_that_relaxes
+from ..functions.energy import Energy
 from ..integrators import OneStepMethod
-from ..results.audit import RoundingScale
 from ..results.audit_evidence import (
     MAX_LOCAL_ERROR_STEPS,
     MAX_SENSITIVITY_STATES,
@@ -23,14 +24,17 @@ from ..results.audit_evidence import (
     MIN_RELATIVE_MOTION,
     SMALLEST_NORMAL,
     Evidence,
+    column_maxima,
     energy_and_entropy,
     evenly_spaced_indices,
     largest_and_evenly_spaced,
+    largest_drifts,
     n_replayed_steps,
     rounding_scales,
     select_worst_steps,
 )
 from ..results.ensemble import Ensemble
+from ..results.rounding_scale import InvariantDrift, RoundingScale
 from ..results.solution import Solution
 from ..results.step_sampling import MAX_SAMPLED_VALUES, REPLAY_COST_RATIO, StepSample
 from ..systems import AttitudeSystem, System
@@ -330,7 +334,9 @@ class EnsembleEvidenceCollector:
     def __call__(self) -> Evidence:
         form, n_members = self.family.form, len(self.x)
         parameters = self.family.parameter_matrix(slice(None), n_members)
-        evidence = Evidence(terms=self._rounding_scales(parameters), conditions=self._conditions())
+        evidence = Evidence(
+            terms=self._rounding_scales(parameters), conditions=self._conditions(), drifts=self._drifts()
+        )
         final, states = self.replay(self.family, self.method, self.x, self.h, self.max_replayed_steps)
         member_of_step, step_number = np.nonzero(
             np.arange(self.max_replayed_steps) < np.fmin(final["step"], self.n_steps_taken)[:, None]
@@ -385,11 +391,28 @@ class EnsembleEvidenceCollector:
     def _conditions(self) -> tuple[RunCondition, ...]:
         """Return the conditions beside the laws, each of the trajectory of the sample where it is worst."""
         guarantees = frozenset(self.method.preserves)
-        known_states = (states[np.isfinite(states).all(axis=1)] for states in self.saved_states)
         return worst_conditions(
             self.family.member(i).run_conditions(states, self.saved_times, guarantees)
-            for i, states in enumerate(known_states)
+            for i, states in enumerate(self._known_states())
         )
+
+    def _drifts(self) -> dict[str, InvariantDrift]:
+        """Return the drifts of what the method promises to keep, each of the trajectory where it is worst."""
+        return largest_drifts(self._member_drifts(i, states) for i, states in enumerate(self._known_states()))
+
+    def _member_drifts(self, i: int, states: np.ndarray) -> dict[str, InvariantDrift]:
+        recorded, laws = invariants_and_laws(self.family.member(i), self.method)
+        functions = {name: function for name, (function, _) in recorded.items() if name in laws.conserved}
+        if not functions or not len(states):
+            return {}
+        values = evaluate_at_points(_function_values, tuple(functions.values()), states)
+        scales = evaluate_at_points(rounding_scales, tuple(functions.values()), states)
+        columns = zip(values.T, *map(column_maxima, scales), strict=True)
+        return {name: InvariantDrift.from_series(*column) for name, column in zip(functions, columns, strict=True)}
+
+    def _known_states(self) -> Iterator[np.ndarray]:
+        """Return the saved states of each trajectory of the sample up to its end; nothing if none were kept."""
+        return (states[np.isfinite(states).all(axis=1)] for states in self.saved_states)
 
     def _rounding_scales(self, parameters: np.ndarray) -> dict[str, float]:
         """Return the scales at which energy and entropy are rounded, each the largest of the sample."""
@@ -403,15 +426,25 @@ class EnsembleEvidenceCollector:
         return np.asarray(self.member.points(x)).reshape(len(x), -1)
 
 
-def _states_for_conditions(record: EnsembleRecord, sample: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return saved states of some trajectories, shape (sample, times, n), and times that are spread over the run."""
+def _states_for_conditions(
+    record: EnsembleRecord, sample: np.ndarray
+) -> tuple[Sequence[np.ndarray] | np.ndarray, np.ndarray]:
+    """Return saved states of some trajectories, shape (sample, times, n), and times that are spread over the run.
+
+    Both are empty if the run keeps no states.
+    """
     if record.trajectories is None:
-        assert record.x is not None
+        if record.x is None:
+            return (), np.zeros(0)
         states = np.stack([record.x0[sample], record.x[sample]], axis=1)
         end = np.nanmax(record.quantities["end_time"])
         return states, np.linspace(record.schedule.start, end, MAX_SENSITIVITY_STATES)
     times = evenly_spaced_indices(record.trajectories.shape[1], MAX_SENSITIVITY_STATES)
     return record.trajectories[sample][:, times, :-2], record.saved_times[times]
+
+
+def _function_values(functions: tuple[Energy, ...], x):
+    return jnp.stack([f.value(x) for f in functions])
 
 
 def _rounding_scales_at(model: tuple[ProgramStructure, int], row):

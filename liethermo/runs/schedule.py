@@ -288,9 +288,9 @@ def make_schedule(
     which states ``save_every`` saves.
     """
     start, end = checked_span(span, allow_infinite_end)
-    step_size = end - start if isinstance(step, Adaptive) else step
+    step_size = end - start if isinstance(step, Adaptive) else checked_step(step, start, end)
     kinks = [t for t in declared.kinks if start < t < end]
-    if not isinstance(step, Adaptive) and (save_every not in (None, 1) or len(kinks) * step > end - start):
+    if not isinstance(step, Adaptive) and (save_every not in (None, 1) or len(kinks) * step_size > end - start):
         kinks = []
     kinks = kinks if len(kinks) <= MAX_KINKS else []
     all_breaks = {*(checked_breaks(breaks) if np.size(breaks) else ()), *declared.jumps, *kinks}

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .. import models
-from ..errors import AxiomError, FileError, InputError, SpecError
+from .. import disk, models
+from ..errors import AxiomError, InputError, SpecError
 from ..integrators import DEFAULT_METHOD, METHODS
 from ..runs.adaptive import Adaptive
 from ..runs.events import Relaxed
@@ -170,21 +170,13 @@ MAX_KEY_PARTS = 100
 
 
 def _parse_file(path: Path) -> dict[str, Any]:
+    with disk.file_errors("read the spec file", path), open(path, "rb") as file:
+        content = file.read(MAX_SPEC_BYTES + 1)
+    if len(content) > MAX_SPEC_BYTES:
+        raise SpecError(path, [f"it is larger than the {MAX_SPEC_BYTES // 2**20} MB that a spec file has at most"])
     try:
-        with open(path, "rb") as file:
-            content = file.read(MAX_SPEC_BYTES + 1)
-        if len(content) > MAX_SPEC_BYTES:
-            raise SpecError(path, [f"it is larger than the {MAX_SPEC_BYTES // 2**20} MB that a spec file has at most"])
         return _parse_toml(content.decode("utf-8"))
-    except OSError as error:
-        if isinstance(error, FileError):
-            raise
-        raise FileError(f"cannot read the spec file {path!s:.200}: {error.strerror}") from error
-    except SpecError:
-        raise
     except ValueError as error:
-        if "\0" in str(path):
-            raise FileError(f"cannot read the spec file {str(path)!r:.200}: it is no path") from error
         raise SpecError(path, [f"it is not valid TOML: {error}"]) from error
 
 
@@ -218,7 +210,7 @@ def _apply_change(table: dict[str, Any], change: str, problems: list[str]) -> No
     for part in parts[:-1]:
         table = table.setdefault(part, {})
         if not isinstance(table, dict):
-            problems.append(f"--set {change}: {part} is no section")
+            problems.append(f"--set {change}: {part} is not a section")
             return
     table[parts[-1]] = value
 

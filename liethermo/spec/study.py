@@ -172,7 +172,7 @@ def _report_if_not_settable(name: str, plan: Spec, problems: list[str]) -> None:
     value = arguments[key]
     for i in index:
         if not isinstance(value, list | tuple) or i >= len(value):
-            problems.append(f"study.axes: {name} is no entry of {key} = {format_value(arguments[key])}")
+            problems.append(f"study.axes: {name} is not an entry of {key} = {format_value(arguments[key])}")
             return
         value = value[i]
     if isinstance(value, list | tuple):

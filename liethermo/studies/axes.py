@@ -117,6 +117,12 @@ def latin_hypercube(count: int, *, seed: int, **ranges) -> Zipped:
     ------
     InputError
         If a range cannot be used.
+
+    Examples
+    --------
+    >>> points = lt.latin_hypercube(4, rate=(0.1, 1.0), ratio=(1.0, 2.0), seed=0)
+    >>> type(points).__name__
+    'Zipped'
     """
     from scipy.stats import qmc
 
@@ -142,6 +148,12 @@ def sobol(count: int, *, seed: int, **ranges) -> Zipped:
     ------
     InputError
         If a range cannot be used.
+
+    Examples
+    --------
+    >>> points = lt.sobol(4, rate=(0.1, 1.0), ratio=(1.0, 2.0), seed=0)
+    >>> type(points).__name__
+    'Zipped'
     """
     from scipy.stats import qmc
 

@@ -28,11 +28,8 @@ def write_file(path: Path, data: bytes) -> None:
     FileError
         If it cannot be written.
     """
-    try:
+    with disk.file_errors("write", path, "Finished chunks are saved; run the study again to continue"):
         disk.write_atomically(path, data)
-    except OSError as error:
-        advice = "Finished chunks are saved; run the study again to continue"
-        raise FileError(f"cannot write {path}: {disk.describe_os_error(error)}. {advice}") from error
 
 
 class TemporaryFolder:
@@ -51,15 +48,10 @@ def read_plain_file(path: Path) -> bytes:
     FileError
         If it cannot be read.
     """
-    try:
-        with open(path, "rb", opener=_open_no_follow) as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise FileError(f"{path} is not a regular file")
-            return file.read()
-    except FileError:
-        raise
-    except OSError as error:
-        raise FileError(f"cannot read {path}: {disk.describe_os_error(error)}") from error
+    with disk.file_errors("read", path), open(path, "rb", opener=_open_no_follow) as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise FileError(f"{path} is not a regular file")
+        return file.read()
 
 
 def _open_no_follow(path: str, flags: int) -> int:
@@ -71,18 +63,13 @@ def require_plain_files(root: Path) -> None:
     """Raise FileError unless a store contains only files and folders: a link may lead outside, and a pipe may block."""
     folders = [os.fspath(root)]
     while folders:
-        try:
-            with os.scandir(folders.pop()) as entries:
-                for entry in entries:
-                    if entry.is_dir(follow_symlinks=False):
-                        folders.append(entry.path)
-                    elif not entry.is_file(follow_symlinks=False):
-                        kind = "a link" if entry.is_symlink() else "no file"
-                        raise FileError(f"{entry.path} is {kind}, and all in the store of a study are plain files")
-        except FileError:
-            raise
-        except OSError as error:
-            raise FileError(f"cannot read {root}: {disk.describe_os_error(error)}") from error
+        with disk.file_errors("read", root), os.scandir(folders.pop()) as entries:
+            for entry in entries:
+                if entry.is_dir(follow_symlinks=False):
+                    folders.append(entry.path)
+                elif not entry.is_file(follow_symlinks=False):
+                    kind = "a link" if entry.is_symlink() else "no file"
+                    raise FileError(f"{entry.path} is {kind}, and all in the store of a study are plain files")
 
 
 def remove_partial_files(root: Path) -> None:
@@ -112,21 +99,15 @@ def lock_store(root: Path) -> Iterator[Callable[[int], None]]:
     FileError
         If another run holds the lock.
     """
-    try:
-        file = open(root / LOCK_FILE, "a+", opener=_open_no_follow)  # noqa: SIM115  (the with block below handles other errors)
-    except OSError as error:
-        raise FileError(f"cannot write into {root}: {disk.describe_os_error(error)}") from error
+    with disk.file_errors("write into", root):
+        file = open(root / LOCK_FILE, "a+", opener=_open_no_follow)  # noqa: SIM115  (closed by the next block)
     with file:
-        try:
-            if not _try_lock(file):
-                raise FileError(
-                    f"another run works on {root}: {describe_lock_holder(root)}. Wait for it, or take another store"
-                )
-        except OSError as error:
-            if isinstance(error, FileError):
-                raise
-            reason = disk.describe_os_error(error)
-            raise FileError(f"{root} cannot be locked ({reason}), so two runs at once would go unnoticed") from error
+        with disk.file_errors("lock", root, "Two runs at once would go unnoticed"):
+            is_locked = _try_lock(file)
+        if not is_locked:
+            raise FileError(
+                f"another run works on {root}: {describe_lock_holder(root)}. Wait for it, or take another store"
+            )
 
         def record_run(n_done: int) -> None:
             run_record = {"host": socket.gethostname(), "pid": os.getpid(), "started": time.time(), "done": n_done}

@@ -19,7 +19,7 @@ WORK_NAME = "work"
 
 
 class Clock(Module):
-    """Index of the time in a state, which the work follows, and the span of the run, at whose breaks functions jump.
+    """The place of the time and the work in a state, and the span of the run, at whose breaks functions of time jump.
 
     Attributes
     ----------

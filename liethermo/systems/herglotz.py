@@ -32,7 +32,7 @@ from .evolution import (
 )
 
 SINGULAR_LAGRANGIAN_MESSAGE = (
-    "the Lagrangian is singular: its Hessian L_vv has no inverse, so eta_L is no contact form and the momentum "
+    "the Lagrangian is singular: its Hessian L_vv has no inverse, so eta_L is not a contact form and the momentum "
     "does not determine the velocity"
 )
 """Error message for a Lagrangian whose momentum does not determine the velocity."""

@@ -110,7 +110,7 @@ class SystemInterface(Geometry):
 
     def joint_rates_at(self, x) -> jax.Array:
         """Return the rates of the joint coordinates, shape (k,), in the order of :attr:`joint_ranges`, at a state x."""
-        raise InputError("the system is no tree of jointed bodies, so it has no joint rates")
+        raise InputError("the system is not a tree of jointed bodies, so it has no joint rates")
 
     @property
     def inner(self) -> SystemInterface | None:

@@ -1,4 +1,4 @@
-"""``LiftedSystem``: a system on longer states that begin with those of another one, whose laws it has."""
+"""``LiftedSystem``: a system on states that extend those of another system, with the laws of that system."""
 
 from __future__ import annotations
 

@@ -134,8 +134,8 @@ def frozen_system(system: System, t: float | None) -> System:
         raise InputError("the parameters of the system are traced values. Call this function outside of jax.jit")
     if system.needs_attitude:
         raise InputError(
-            f"the torque {system.torque_name} depends on the attitude, so a momentum alone is no equilibrium. Remove "
-            "the torque, or write the attitude as part of the state"
+            f"the torque {system.torque_name} depends on the attitude, so a momentum alone is not an equilibrium. "
+            "Remove the torque, or write the attitude as part of the state"
         )
     if not system.is_driven:
         return system

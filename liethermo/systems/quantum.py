@@ -143,7 +143,9 @@ class QuantumSystem(System):
             entropy = IsolatedVonNeumann(self.floor)  # the motion does not depend on it
         terms = [_bind_to_density(term, structure) for term in _dissipation_terms(dissipation)]
         if baths is not None and not any(isinstance(term, ThermalJumps) for term in terms):
-            raise InputError("baths exchange heat by lt.ThermalJumps, and there are none: leave out baths=")
+            raise InputError(
+                "baths= needs lt.ThermalJumps, which exchange heat with the baths. Add them, or remove baths="
+            )
         n, m = structure.dim, 0 if baths is None else baths.number
         poisson: mf.PoissonStructure = structure
         total_entropy: Energy = entropy
@@ -261,9 +263,7 @@ class QuantumSystem(System):
         """Return ``tr(rho A)`` of states, shape (..., n) to (...), for an observable A, Hermitian, shape (N, N)."""
         observable = checked_hermitian(observable, "the observable")
         if observable.shape != (self.structure.size,) * 2:
-            raise InputError(
-                f"the observable has shape {observable.shape}, and the state that of {self.structure.size}"
-            )
+            raise InputError(f"the observable must have shape {(self.structure.size,) * 2}, got {observable.shape}")
         return jnp.asarray(x)[..., : self.body_dim] @ self.structure.vector(observable)
 
     def bloch(self, x, part: int | str = 0) -> jax.Array:

@@ -226,7 +226,7 @@ def check_entropy_near_motion(case: RelationCase) -> SkipReason:
 def check_closed_over_parameters(case: RelationCase) -> SkipReason:
     """Check that parameters may be leaves of a system or constants in a closure."""
     if case.system.is_driven or case.system.space is not None:
-        return "the energy is no plain function of the state"
+        return "the energy is not a plain function of the state"
     case.compare_run(
         "parameters closed over", case.run(replace_parts(case.system, energy=close_over_parameters(case.system.energy)))
     )

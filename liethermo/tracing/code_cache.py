@@ -92,7 +92,7 @@ def _trusted_folder() -> Path | None:
     if stat.S_ISLNK(folder_status.st_mode):
         _warn_untrusted(str(folder), "it is a link")
     elif not stat.S_ISDIR(folder_status.st_mode):
-        _warn_untrusted(str(folder), "it is no folder")
+        _warn_untrusted(str(folder), "it is not a folder")
     elif reason := _why_untrusted(folder_status):
         _warn_untrusted(str(folder), reason)
     else:

@@ -58,7 +58,13 @@ def registered() -> Iterator[LieAlgebra]:
 
 @register((1,), (3,))
 def abelian(n: int) -> LieAlgebra:
-    """Return the abelian algebra R^n, as translations."""
+    """Return the abelian algebra R^n, as translations.
+
+    Examples
+    --------
+    >>> float(abs(mf.abelian(2).structure_constants).max())
+    0.0
+    """
     n = checked_size(n, 1, "abelian(n)")
     basis = np.zeros((n, n + 1, n + 1))
     basis[np.arange(n), np.arange(n), n] = 1.0
@@ -112,6 +118,11 @@ def su(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
     """Return su(n): anti-Hermitian traceless matrices ``-i lambda_a / 2`` of the (generalised) Gell-Mann matrices.
 
     su(2) has the structure constants of so(3); su(3) the usual f_abc.
+
+    Examples
+    --------
+    >>> mf.su(3).dim
+    8
     """
     n = checked_size(n, 2, "su(n)")
     data = ClassicalData(n - 1, (0, n * n - 1, 0), (2.0 * n, 0.0), True, tuple(range(2, n + 1)))
@@ -120,7 +131,13 @@ def su(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
 
 @register((2,))
 def u(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
-    """Return u(n), the anti-Hermitian matrices: the basis of su(n), then the centre ``-i/2 sqrt(2/n) 1``."""
+    """Return u(n), the anti-Hermitian matrices: the basis of su(n), then the centre ``-i/2 sqrt(2/n) 1``.
+
+    Examples
+    --------
+    >>> mf.u(2).dim
+    4
+    """
     n = checked_size(n, 1, "u(n)")
     data = ClassicalData(n, (0, n * n - 1, 1), (2.0 * n, 2.0), True, tuple(range(1, n + 1)))
     return _classical_algebra(f"u({n})", n, data, by_matrices, lambda: matrix_bases.unitary_basis(n, has_centre=True))
@@ -132,6 +149,11 @@ def sl(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
     triangle.
 
     sl(2) is (h, e, f) with ``[h, e] = 2e``, ``[h, f] = -2f``, ``[e, f] = h``.
+
+    Examples
+    --------
+    >>> mf.sl(2).dim
+    3
     """
     n = checked_size(n, 2, "sl(n)")
     rotations = n * (n - 1) // 2
@@ -141,7 +163,13 @@ def sl(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
 
 @register((1,), (2,))
 def sp(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
-    """Return sp(2n, R): matrices ``[[A, B], [C, -A^T]]`` with B and C symmetric; A row by row, then B, then C."""
+    """Return sp(2n, R): matrices ``[[A, B], [C, -A^T]]`` with B and C symmetric; A row by row, then B, then C.
+
+    Examples
+    --------
+    >>> mf.sp(1).dim
+    3
+    """
     n = checked_size(n, 1, "sp(n)")
     data = ClassicalData(n, (n * (n + 1), n * n, 0), (2.0 * n + 2.0, 0.0), False, tuple(range(2, 2 * n + 1, 2)))
     return _classical_algebra(f"sp({n})", 2 * n, data, by_matrices, lambda: matrix_bases.symplectic_basis(n))
@@ -180,7 +208,13 @@ _OCTONIONS = (
 
 @register((1,), (2,))
 def gl(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
-    """Return gl(n), all real matrices, with the basis E_ij row by row."""
+    """Return gl(n), all real matrices, with the basis E_ij row by row.
+
+    Examples
+    --------
+    >>> mf.gl(2).dim
+    4
+    """
     n = checked_size(n, 1, "gl(n)")
     rotations = n * (n - 1) // 2
     data = ClassicalData(n, (n * n - 1 - rotations, rotations, 1), (2.0 * n, 2.0), False, tuple(range(1, n + 1)))
@@ -189,7 +223,13 @@ def gl(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
 
 @register((2,), (3,))
 def se(n: int) -> LieAlgebra:
-    """Return the rigid motions of R^n: the rotations so(n) first, then the translations."""
+    """Return the rigid motions of R^n: the rotations so(n) first, then the translations.
+
+    Examples
+    --------
+    >>> mf.se(3).dim
+    6
+    """
     n = checked_size(n, 2, "se(n)")
     rotations = so(n)
     return semidirect_sum(rotations, rotations.basis, name=f"se({n})")
@@ -197,7 +237,13 @@ def se(n: int) -> LieAlgebra:
 
 @register((1,), (2,))
 def heisenberg(n: int = 1) -> LieAlgebra:
-    """Return the Heisenberg algebra (q_1 … q_n, p_1 … p_n, z) with ``[q_i, p_i] = z``, as upper triangular matrices."""
+    """Return the Heisenberg algebra (q_1 … q_n, p_1 … p_n, z) with ``[q_i, p_i] = z``, as upper triangular matrices.
+
+    Examples
+    --------
+    >>> mf.heisenberg(2).dim
+    5
+    """
     n = checked_size(n, 1, "heisenberg(n)")
     q = [_matrix_unit(n + 2, 0, i + 1) for i in range(n)]
     p = [_matrix_unit(n + 2, i + 1, n + 1) for i in range(n)]
@@ -246,6 +292,11 @@ def bianchi(kind: str, h: float | None = None) -> LieAlgebra:
     ------
     ParameterError
         If the kind is unknown, h is missing, has the wrong sign, or is given where it has no meaning.
+
+    Examples
+    --------
+    >>> mf.bianchi("VIII").dim
+    3
     """
     if kind not in BIANCHI_KINDS:
         raise ParameterError(f"kind must be one of {', '.join(BIANCHI_KINDS)}, got {kind!r}")

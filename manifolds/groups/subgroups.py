@@ -63,7 +63,7 @@ def subalgebra_basis(group: MatrixGroup, spanning_matrices) -> np.ndarray:
         bracket = components(a @ b - b @ a)
         if (residual := np.linalg.norm(bracket - rows.T @ (rows @ bracket))) > SUBALGEBRA_TOLERANCE:
             raise ParameterError(
-                f"the stabilizer in {group.name} is no subalgebra: the bracket of its directions {j} and {i} is "
+                f"the stabilizer in {group.name} is not a subalgebra: the bracket of its directions {j} and {i} is "
                 f"{residual:.2g} off their span; add what is missing"
             )
     return rows

@@ -23,7 +23,7 @@ from .poisson import PoissonStructure
 
 
 class ContactStructure(Module):
-    """Contact structure; subclasses implement :meth:`form`, and override what they know in closed form.
+    """Contact structure; subclasses implement :meth:`form`, and override methods that have a closed form.
 
     Attributes
     ----------

@@ -29,6 +29,12 @@ def _names() -> frozenset[str]:
     return frozenset(names)
 
 
+@functools.cache
+def _modules() -> frozenset[str]:
+    """Return the names of the modules, which a new name may begin with."""
+    return frozenset(path.stem for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
+
+
 def _top_level_names(module: str) -> set[str]:
     """Return the names that a module defines, without those that it imports; none if there is no such module."""
     path = ROOT / f"{module.replace('.', '/')}.py"
@@ -48,7 +54,7 @@ def _faults(rows: list[dict[str, str]]) -> Iterator[str]:
     new_names = {(row["module"], row["new name"]) for row in rows}
     for row in rows:
         module, old, new = row["module"], row["old name"], row["new name"]
-        if new not in _names():
+        if not {*new.split(".")} <= _names() | _modules():
             yield f"{module} {row['scope']}: {old} -> {new}: no such name; correct the line, or delete it"
         elif module == "*" and old in _names():
             yield f"{old} -> {new}: the old name is still in the code"

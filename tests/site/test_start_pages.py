@@ -34,16 +34,16 @@ def test_both_indices_have_a_card_for_every_start_page():
 def test_every_picture_of_a_card_is_drawn_and_shown(monkeypatch):
     monkeypatch.syspath_prepend(str(DOCS))
     cards = importlib.import_module("cards")
-    drawn = {page.rpartition("/")[2] for page in cards.FIGURES}
-    assert drawn == {path.stem for path in cards.CARDS.glob("*.png")}
-    assert drawn == {name for page in PAGES for name in CARD.findall(page.read_text())}
+    drawn_names = {page.rpartition("/")[2] for page in cards.FIGURES}
+    assert drawn_names == {path.stem for path in cards.CARDS.glob("*.png")}
+    assert drawn_names == {name for page in PAGES for name in CARD.findall(page.read_text())}
     assert all((DOCS / f"{page}.md").is_file() for page in cards.FIGURES)
 
 
 def _keywords(text: str) -> set[str]:
     """Return the words that the search finds a page by, beside those of its text."""
-    found = re.match(r'---\nmyst:\n  html_meta:\n    keywords: "(.*)"\n---\n', text)
-    return {word.strip().lower() for word in found[1].split(",")} if found else set()
+    match = re.match(r'---\nmyst:\n  html_meta:\n    keywords: "(.*)"\n---\n', text)
+    return {word.strip().lower() for word in match[1].split(",")} if match else set()
 
 
 @pytest.mark.parametrize(
@@ -72,19 +72,21 @@ def _keywords(text: str) -> set[str]:
 )
 def test_the_search_finds_the_page_of_a_word(words, page):
     text = (DOCS / f"{page}.md").read_text()
-    found = _keywords(text) | set(re.findall(r"\w+", text.lower()))
-    assert set(re.findall(r"\w+", words.lower())) <= found
+    page_words = _keywords(text) | set(re.findall(r"\w+", text.lower()))
+    assert set(re.findall(r"\w+", words.lower())) <= page_words
 
 
 def test_keywords_are_single_words():
     """Sphinx finds a keyword as a whole, and what a reader types word by word."""
-    wrong = {page.stem: word for page in PAGES for word in _keywords(page.read_text()) if re.search(r"[\s-]", word)}
-    assert wrong == {}
+    faulty_words = {
+        page.stem: word for page in PAGES for word in _keywords(page.read_text()) if re.search(r"[\s-]", word)
+    }
+    assert faulty_words == {}
     assert sum(bool(_keywords(page.read_text())) for page in PAGES) > 30
 
 
 def test_the_search_lists_last_pages_that_exist():
-    last = re.findall(r'^  "([\w/]+)",$', (DOCS / "search_scorer.js").read_text(), re.MULTILINE)
-    assert {"reference/changelog", "reference/bibliography", "reference/benchmarks"} <= set(last)
-    assert all((DOCS / f"{page}.md").is_file() for page in last)
+    last_pages = re.findall(r'^  "([\w/]+)",$', (DOCS / "search_scorer.js").read_text(), re.MULTILINE)
+    assert {"reference/changelog", "reference/bibliography", "reference/benchmarks"} <= set(last_pages)
+    assert all((DOCS / f"{page}.md").is_file() for page in last_pages)
     assert 'str(HERE / "search_scorer.js")' in (DOCS / "conf.py").read_text()  # Sphinx reads it from anywhere

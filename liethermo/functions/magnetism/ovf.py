@@ -75,7 +75,7 @@ def read_ovf(path) -> VectorField:
         dim = int(header["valuedim"]) if version == 2 else 3
         factor = float(header.get("valuemultiplier", 1.0)) if version == 1 else 1.0
     except (KeyError, ValueError) as error:
-        raise FileError(f"{name} has no valid header: the entry {error} is missing or no number") from error
+        raise FileError(f"{name} has no valid header: the entry {error} is missing or is not a number") from error
     if min(*nodes, dim) < 1:
         raise FileError(f"{name} must have positive numbers of cells and components, got {nodes} and {dim}")
     count = int(np.prod(nodes)) * dim
@@ -196,7 +196,7 @@ def _version_of_line(line: str, name: str) -> int:
             return 2
         if "v1.0" in text or text.endswith("1.0") or "v0.99" in text:
             return 1
-    raise FileError(f"{name} is no OVF file of version 1.0 or 2.0: its first line is {line[:60]!r}")
+    raise FileError(f"{name} is not an OVF file of version 1.0 or 2.0: its first line is {line[:60]!r}")
 
 
 def _read_data(content: bytes, start: int, kind: str, version: int, count: int, name: str) -> np.ndarray:

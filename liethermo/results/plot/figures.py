@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
 from ... import disk
-from ...errors import FileError, InputError
+from ...errors import InputError
 
 SUFFIXES = (".pdf", ".png", ".svg")
 """Suffixes of the file formats of figures."""
@@ -43,8 +43,6 @@ def save_figure(figure: Figure, path: Path | None) -> Figure:
             figure.savefig(buffer, format=path.suffix[1:].lower())
         finally:
             plt.close(figure)
-        try:
+        with disk.file_errors("write", path):
             disk.write_atomically(path, buffer.getbuffer())
-        except (OSError, ValueError) as error:  # ValueError for an invalid path
-            raise FileError(f"cannot write {path}: {disk.describe_os_error(error)}") from error
     return figure

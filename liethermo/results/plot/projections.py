@@ -145,7 +145,8 @@ def _label_and_function(
     if isinstance(coordinate, str):
         if names is None or coordinate not in names:
             raise InputError(
-                f"{coordinate!r} is no name of a basis element: they are {', '.join(names) if names else 'not known'}"
+                f"{coordinate!r} is not the name of a basis element: they are "
+                f"{', '.join(names) if names else 'not known'}"
             )
         coordinate = names.index(coordinate)
     n = solution.x.shape[1]

@@ -99,9 +99,11 @@ def test_noise_of_conduction_has_the_distribution_of_equal_energy():
     T = T_0[0] + U / C[0], T_0[1] + (total - U) / C[1]
     weight = T[0] ** (C[0] - 1) * T[1] ** (C[1] - 1) * width
     exact = np.array([np.sum(weight * f) / np.sum(weight) for f in (*T, z)])
-    found = np.column_stack([system.temperatures(x), x[:, 2]])
-    assert (np.abs(found.mean(axis=0) - exact) < 4.0 * found.std(axis=0) / np.sqrt(len(found))).all()
-    assert (found.std(axis=0) > 0.05).all()
+    observations = np.column_stack([system.temperatures(x), x[:, 2]])
+    assert (
+        np.abs(observations.mean(axis=0) - exact) < 4.0 * observations.std(axis=0) / np.sqrt(len(observations))
+    ).all()
+    assert (observations.std(axis=0) > 0.05).all()
 
 
 def test_many_spins_conduct_component_by_component():

@@ -149,11 +149,11 @@ def test_jump_operators_that_depend_on_time_are_those_of_dop853(method, error):
     def field(t, v):
         return liouvillian(H, [(turning_operator(t, np), 0.2 * (1.5 + np.sin(t))), (SZ, 0.05)]) @ v
 
-    expected = scipy.integrate.solve_ivp(
+    rho_by_dop853 = scipy.integrate.solve_ivp(
         field, (0.0, 4.0), RHO.ravel().astype(complex), method="DOP853", rtol=1e-12, atol=1e-13
     ).y[:, -1]
     run = lt.integrate(system, system.state(RHO), (0.0, 4.0), 0.02, method)
-    np.testing.assert_allclose(system.density(run.x[-1]).ravel(), expected, atol=error)
+    np.testing.assert_allclose(system.density(run.x[-1]).ravel(), rho_by_dop853, atol=error)
     assert np.ptp(run.casimirs["tr(rho)"]) < 1e-13
     audit = run.audit()
     assert audit.passed
@@ -182,9 +182,9 @@ def test_an_operator_in_a_rotating_frame_has_the_motion_of_the_laboratory():
         return jnp.exp(1j * levels[:, None] * t) * V * jnp.exp(-1j * levels * t)
 
     frame = lt.QuantumSystem(np.zeros((3, 3)), lt.LindbladJumps([(operator, rate)]))
-    end, other = (lt.integrate(s, s.state(rho), (0.0, 3.0), 0.05, METHOD).x[-1] for s in (laboratory, frame))
+    end, end_in_frame = (lt.integrate(s, s.state(rho), (0.0, 3.0), 0.05, METHOD).x[-1] for s in (laboratory, frame))
     U = np.diag(np.exp(1j * np.diag(G) * 3.0))
-    np.testing.assert_allclose(frame.density(other), U @ laboratory.density(end) @ U.conj().T, atol=1e-10)
+    np.testing.assert_allclose(frame.density(end_in_frame), U @ laboratory.density(end) @ U.conj().T, atol=1e-10)
 
 
 def test_operators_that_are_no_functions_of_time_are_refused():

@@ -240,6 +240,7 @@ def heavy_top(friction=True):
     )
 
 
+@pytest.mark.slow
 def test_heavy_top_with_friction():
     """The energy and |p|^2 are constant to rounding, and l.p grows."""
     system, casimir, S = heavy_top()

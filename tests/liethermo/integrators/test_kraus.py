@@ -95,8 +95,8 @@ def test_the_audit_of_an_ensemble_shows_the_least_eigenvalue(outputs, tmp_path):
     gauss = rows[lt.MetriplecticGauss]
     assert gauss.passed is None
     if outputs == "trajectory":
-        expected = min(np.linalg.eigvalsh(system.density(many.x))[np.isfinite(many.energy)].min(), 0.0)
-        assert gauss.value == pytest.approx(expected, abs=1e-12)
+        min_eigenvalue = min(np.linalg.eigvalsh(system.density(many.x))[np.isfinite(many.energy)].min(), 0.0)
+        assert gauss.value == pytest.approx(min_eigenvalue, abs=1e-12)
 
 
 def test_a_fast_precession_needs_no_short_steps():

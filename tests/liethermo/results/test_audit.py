@@ -476,6 +476,33 @@ def test_an_ensemble_reports_an_entropy_that_should_be_constant(outputs):
         assert only_row(single, "entropy drift").passed is only_row(many, "entropy drift").passed is passes
 
 
+class WrongClaim(lt.OneStepMethod):
+    """Slopes at the middle of a step along a straight line, which keep no Casimir, whatever the class claims."""
+
+    stages = 1
+    order = 2
+    preserves = frozenset({"energy", "casimirs"})
+
+    def slopes(self, system, x, compensation, h, k):
+        return system.vector_field(x + 0.5 * h * system.vector_field(x))[None]
+
+    def increment(self, h, k):
+        return h * k[0]
+
+
+@pytest.mark.parametrize("outputs", ["trajectory", "final"])
+@pytest.mark.parametrize(("method", "passes"), [(lt.MetriplecticMidpoint(), True), (WrongClaim(), False)])
+def test_an_ensemble_reports_the_drift_of_functions_that_should_be_constant(outputs, method, passes):
+    """The row of an ensemble has the largest drift of its trajectories."""
+    system = lt.LiePoissonSystem(mf.so(3), lt.Quadratic([1.0, 2.0, 5.0]))
+    x0s = np.array([[0.4, -0.8, 1.2], [0.9, 0.1, -0.5], [0.0, 0.7, 0.2]])
+    many = lt.ensemble(system, x0s, (0.0, 5.0), 0.25, method, outputs=outputs)
+    (row,) = rows(many.audit(), "drift of mu1**2 + mu2**2 + mu3**2")
+    member_drifts = [rows(run.audit(), row.law)[0].value for run in many]
+    assert row.passed is passes
+    assert many.audit().casimir_drift == row.value == pytest.approx(max(member_drifts), abs=1e-15)
+
+
 # -- what is conserved ------------------------------------------------------------------------------------------------
 
 

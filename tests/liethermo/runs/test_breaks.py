@@ -358,6 +358,6 @@ def test_tables_in_ensembles(reference_with_table):
         body, X0, (0.0, END), lt.Adaptive(1e-9), method, parameters={"torque.moments": scales[:, None, None] * MOMENTS}
     )
     assert np.abs(many.x[0] - reference_with_table).max() < 2e-9
-    delayed = np.stack([KNOTS, KNOTS + 0.2])  # no common times at which steps could end
-    other = lt.ensemble(body, X0, (0.0, END), 0.01, method, parameters={"torque.times": delayed})
-    assert np.abs(other.x[0] - reference_with_table).max() < 1e-4
+    table_times = np.stack([KNOTS, KNOTS + 0.2])  # no common times at which steps could end
+    many_times = lt.ensemble(body, X0, (0.0, END), 0.01, method, parameters={"torque.times": table_times})
+    assert np.abs(many_times.x[0] - reference_with_table).max() < 1e-4

@@ -240,9 +240,9 @@ def test_implicit_functions_have_derivatives_of_derivatives():
     modes = jax.jacfwd, jax.jacrev
     for outer, inner in itertools.product(modes, modes):
         slopes = inner(root, 1)
-        found = [jax.jit(jax.vmap(f, (None, 0)))(p, x) for f in (slopes, outer(slopes, 1))]
-        assert np.abs(found[0] - y_first).max() < 1e-12
-        assert np.abs(found[1] - second).max() < 1e-12
+        derivatives = [jax.jit(jax.vmap(f, (None, 0)))(p, x) for f in (slopes, outer(slopes, 1))]
+        assert np.abs(derivatives[0] - y_first).max() < 1e-12
+        assert np.abs(derivatives[1] - second).max() < 1e-12
     guess_derivative = jax.grad(lambda guess: implicit_solution(lambda p, guess: p, lambda p, y: y - p, p, guess))(0.0)
     assert guess_derivative == 0.0
     second_derivatives = (

@@ -1097,13 +1097,13 @@ BAD = {
     "bath 1, but there are 1": lambda q: lt.QuantumSystem(
         QUBIT, lt.ThermalJumps([(LOWER, 1.0)], bath=1), baths=infinite()
     ),
-    "leave out baths": lambda q: lt.QuantumSystem(QUBIT, baths=infinite()),
+    "or remove baths=": lambda q: lt.QuantumSystem(QUBIT, baths=infinite()),
     "lt.ThermalJumps or": lambda q: lt.QuantumSystem(QUBIT, lt.DoubleBracket(1.0)),
     r"the rate of V\[0\] is a number, or a function .* not to": lambda q: lt.ThermalJumps([(LOWER, lambda w, T: [w])]),
     "at omega = 1 and T = 1 it is -1": lambda q: lt.ThermalJumps([(LOWER, lambda w, T: -1.0)]),
     r"to a number >= 0: .*positional argument": lambda q: lt.ThermalJumps([(LOWER, lambda w: 1.0)]),
     r"got an array of float64, shape \(0, 0\)": lambda q: lt.QuantumSystem(np.zeros((0, 0))),
-    "the observable has shape": lambda q: q.expectation(q.state(RHO), np.eye(3)),
+    "the observable must have shape": lambda q: q.expectation(q.state(RHO), np.eye(3)),
     "mixed is a share": lambda q: q.state(RHO, mixed="half"),
     "matrix is not Hermitian": lambda q: q.state(RHO + 0.1 * LOWER),
     "least eigenvalue is": lambda q: q.state(np.diag([1.2, -0.2])),

@@ -151,9 +151,9 @@ def test_chains_of_several_atoms_are_direct_sums():
         edges = 4.0 * (cut + 0.5) + np.array([r[cut, 0], -r[cut, 0]])
         rest = np.sum(0.5 / edges**2) / 4.0  # integral of 1 / x^3, midpoint rule
         total = total + rest * np.diag([-2.0, 1.0, 1.0])
-        found = tensors[:, a, b, o]
+        tensor = tensors[:, a, b, o]
         expected = [total[i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]
-        np.testing.assert_allclose(found, expected, atol=2e-11)
+        np.testing.assert_allclose(tensor, expected, atol=2e-11)
 
 
 @pytest.mark.parametrize(

@@ -57,8 +57,8 @@ def test_bonds_are_the_pairs_at_their_distance(name, borders):
     crystal = mag.lattice(name, (4, 3, 3)[:axes], constant=1.7, periodic=periodic)
     shells = crystal.shells(1 if name in ("chain", "square", "sc", "triangular") else 2)
     for shell in shells[:1] if borders == "open" and axes == 3 else shells:
-        found = sorted(tuple(sorted(pair)) for pair in shell.site_pairs().tolist())
-        assert found == pairs_by_distance(crystal, shell.distance)
+        pairs = sorted(tuple(sorted(pair)) for pair in shell.site_pairs().tolist())
+        assert pairs == pairs_by_distance(crystal, shell.distance)
 
 
 def test_short_periodic_axes_are_refused_or_counted_with_images():

@@ -24,8 +24,8 @@ def test_ferromagnets_have_their_dispersion(name):
     energy = [mag.exchange(crystal, 0.7), mag.anisotropy(crystal, 0.1), mag.zeeman(crystal, (0, 0, 0.3))]
     r = crystal.shell(1).vectors
     expected = 0.7 * 2.0 * np.sum(1.0 - np.cos(WAVES @ r.T), axis=1) + 0.2 + 0.3
-    found = mag.spin_wave_frequencies(energy, crystal, up(crystal), WAVES)
-    np.testing.assert_allclose(found[:, 0], expected, rtol=1e-12)
+    frequencies = mag.spin_wave_frequencies(energy, crystal, up(crystal), WAVES)
+    np.testing.assert_allclose(frequencies[:, 0], expected, rtol=1e-12)
 
 
 def test_an_antiferromagnet_in_meV_and_ps():
@@ -36,13 +36,13 @@ def test_an_antiferromagnet_in_meV_and_ps():
     neel = (-1.0) ** (i + j)[..., None] * UP
     q = np.array([[0.2, 0.1, 0.0], [0.05, 0.3, 0.0], [0.0, 0.0, 0.0]])
     ratio = 1.0 / u.hbar
-    found = mag.spin_wave_frequencies(mag.exchange(crystal, J), crystal, neel, q, ratio, magnetic_cell=(2, 2))
+    frequencies = mag.spin_wave_frequencies(mag.exchange(crystal, J), crystal, neel, q, ratio, magnetic_cell=(2, 2))
     gamma = 0.5 * (np.cos(4.0 * q[:, 0]) + np.cos(4.0 * q[:, 1]))
     expected = 4.0 * abs(J) / u.hbar * np.sqrt(1.0 - gamma**2)
     # the cell has four spins: the wave q, and q + (pi, 0)
-    np.testing.assert_allclose(np.abs(found - expected[:, None]).min(axis=1), 0.0, atol=1e-7 * expected.max())
+    np.testing.assert_allclose(np.abs(frequencies - expected[:, None]).min(axis=1), 0.0, atol=1e-7 * expected.max())
     for k in range(2):
-        assert (np.abs(found[k] / expected[k] - 1.0) < 1e-10).sum() == 2
+        assert (np.abs(frequencies[k] / expected[k] - 1.0) < 1e-10).sum() == 2
     with pytest.raises(lt.LiethermoError, match="do not repeat"):
         mag.spin_wave_frequencies(mag.exchange(crystal, J), crystal, neel, q)
 
@@ -53,9 +53,11 @@ def test_antisymmetric_exchange_shifts_waves_of_one_direction():
     crystal = mag.lattice("chain", 12)
     energy = [mag.exchange(crystal, J), mag.dzyaloshinskii_moriya(crystal, (0, 0, D)), mag.anisotropy(crystal, K)]
     q = np.array([[0.7, 0.0, 0.0], [-0.7, 0.0, 0.0]])
-    found = mag.spin_wave_frequencies(energy, crystal, up(crystal), q)[:, 0]
+    frequencies = mag.spin_wave_frequencies(energy, crystal, up(crystal), q)[:, 0]
     base = 2.0 * J * (1.0 - np.cos(0.7)) + 2.0 * K
-    np.testing.assert_allclose(np.sort(found), [base - 2 * D * np.sin(0.7), base + 2 * D * np.sin(0.7)], rtol=1e-12)
+    np.testing.assert_allclose(
+        np.sort(frequencies), [base - 2 * D * np.sin(0.7), base + 2 * D * np.sin(0.7)], rtol=1e-12
+    )
 
 
 def test_a_honeycomb_magnet_has_a_gap_at_its_corner():
@@ -66,8 +68,8 @@ def test_a_honeycomb_magnet_has_a_gap_at_its_corner():
     energy = [mag.exchange(crystal, 1.0), mag.dzyaloshinskii_moriya(crystal.bonds(rows), (0, 0, D))]
     b = crystal.reciprocal_vectors
     corner = (2 * b[0] + b[1]) / 3.0
-    found = mag.spin_wave_frequencies(energy, crystal, up(crystal), corner)
-    np.testing.assert_allclose(found, [3.0 - 3 * 3**0.5 * D, 3.0 + 3 * 3**0.5 * D], rtol=1e-12)
+    frequencies = mag.spin_wave_frequencies(energy, crystal, up(crystal), corner)
+    np.testing.assert_allclose(frequencies, [3.0 - 3 * 3**0.5 * D, 3.0 + 3 * 3**0.5 * D], rtol=1e-12)
 
 
 def test_a_state_that_moves_or_is_unstable():

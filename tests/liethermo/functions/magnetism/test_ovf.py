@@ -126,7 +126,7 @@ def test_damaged_files_are_refused(tmp_path):
     cases = {
         "is not complete": content[:-200],
         "is damaged": content.replace(struct.pack("<d", 123456789012345.0), struct.pack("<d", 1.0)),
-        "is no OVF file": b"hello\n" + content,
+        "is not an OVF file": b"hello\n" + content,
         "irregular mesh": content.replace(b"meshtype: rectangular", b"meshtype: irregular"),
         "no valid header": content.replace(b"xnodes", b"xknots"),
         "has no data": content[:300],

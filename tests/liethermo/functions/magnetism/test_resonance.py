@@ -50,11 +50,11 @@ def test_the_film_rings_as_in_oommf():
     )
     assert (np.diff(run.energy) < 0.0).all()
     means = np.asarray(system.spins(run.x)).mean(axis=(1, 2, 3))
-    for time, expected in OOMMF_MEANS.items():
-        np.testing.assert_allclose(means[np.argmin(np.abs(run.t - time))], expected, atol=1e-7)
+    for time, oommf_mean in OOMMF_MEANS.items():
+        np.testing.assert_allclose(means[np.argmin(np.abs(run.t - time))], oommf_mean, atol=1e-7)
     y = means[:-1, 1] - means[-1, 1]
-    window, padded = np.hanning(2 * len(y))[len(y) :], 16 * len(y)
-    frequencies, power = np.fft.rfftfreq(padded, run.t[1]) * 1e-9, np.abs(np.fft.rfft(y * window, padded))
+    window, n_padded = np.hanning(2 * len(y))[len(y) :], 16 * len(y)
+    frequencies, power = np.fft.rfftfreq(n_padded, run.t[1]) * 1e-9, np.abs(np.fft.rfft(y * window, n_padded))
     peaks = 1 + np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] > power[2:]))
-    largest = peaks[np.argsort(power[peaks])[-2:]]
-    np.testing.assert_allclose(np.sort(frequencies[largest]), [8.25, 11.25], atol=0.06)
+    peak_indices = peaks[np.argsort(power[peaks])[-2:]]
+    np.testing.assert_allclose(np.sort(frequencies[peak_indices]), [8.25, 11.25], atol=0.06)

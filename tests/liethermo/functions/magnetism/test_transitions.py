@@ -53,9 +53,9 @@ def test_the_crossing_of_two_magnets_without_interaction_is_extrapolated():
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         energy = N * (-0.5 * lengths**2 + 0.25 * lengths**4)
         samples.append(mag.MagnetSamples(T, energy, lengths[:, None] * directions))
-    found = mag.cumulant_crossing(*samples)
-    assert abs(found.value - 1.0) < 4.0 * found.error
-    assert found.error < 6e-3
+    crossing = mag.cumulant_crossing(*samples)
+    assert abs(crossing.value - 1.0) < 4.0 * crossing.error
+    assert crossing.error < 6e-3
 
 
 BAD = {
@@ -102,6 +102,6 @@ def test_crystals_lose_their_order_at_the_temperature_of_the_literature(name, li
                 means.append(spins[1:].reshape(len(spins) - 1, -1, 3).mean(axis=1))
         samples.append(mag.MagnetSamples(literature, np.concatenate(energies), np.concatenate(means)))
         assert mag.binder_cumulant(samples[-1].magnetisation).value == pytest.approx(0.6217, abs=0.02)  # Holm & Janke
-    found = mag.cumulant_crossing(*samples)
-    assert found.error < 0.01 * literature  # the fcc run measures 0.84 %
-    assert abs(found.value - literature) < 0.01 * literature
+    crossing = mag.cumulant_crossing(*samples)
+    assert crossing.error < 0.01 * literature  # the fcc run measures 0.84 %
+    assert abs(crossing.value - literature) < 0.01 * literature
