@@ -257,7 +257,7 @@ def test_pictures_appear_whole_or_not_at_all(solution, tmp_path, monkeypatch, su
 def test_a_pipe_or_a_device_is_not_replaced(solution, tmp_path):
     os.mkfifo(tmp_path / "pipe.nc")
     for path in (tmp_path / "pipe.nc", tmp_path):
-        with pytest.raises(lt.FileError, match="no plain file"):
+        with pytest.raises(lt.FileError, match="not a plain file"):
             solution.save(path)
     assert (tmp_path / "pipe.nc").is_fifo()
     with pytest.raises(lt.FileError, match="there is no file"):  # without waiting for the pipe
