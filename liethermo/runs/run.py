@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -24,6 +25,8 @@ from ..results.dense_output import DenseOutput
 from ..results.events import Events
 from ..results.solution import Solution, defer
 from ..results.status import Stats, Status
+from ..systems import System
+from ..systems.clock import system_of_step
 from ..tracing.interpret import evaluate_at_points
 from .adaptive import Adaptive, make_step_control
 from .adaptive_run import MAX_STORED_VALUES, AcceptedSteps, advance_to_end
@@ -256,7 +259,7 @@ class Run:
         return x, n_evaluations, message, was_interrupted
 
     def _energies_and_entropies(self, x: np.ndarray) -> np.ndarray:
-        return np.stack(evaluate_at_points(energy_and_entropy_at, self.system, x), axis=1)
+        return np.stack(evaluate_at_points(_energy_and_entropy_after_break, self.system, x), axis=1)
 
     # -- the result ---------------------------------------------------------------------------------------------------
 
@@ -316,6 +319,11 @@ class Run:
                 **({"breaks": list(schedule.breaks)} if schedule.breaks else {}),
             )
         )
+
+
+def _energy_and_entropy_after_break(system: System, x) -> tuple[jax.Array, jax.Array]:
+    """Return energy and entropy at x, shape (n,); at a break their limits from after, as the work has its jump."""
+    return energy_and_entropy_at(system_of_step(system, x), x)
 
 
 def _longest_steps(schedule: StepSchedule, taken_steps: Sequence[np.ndarray], n_intervals: int) -> np.ndarray:
