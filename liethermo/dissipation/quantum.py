@@ -271,7 +271,7 @@ class ThermalJumps(Dissipation):
         )
 
     def _from_jump_frame(self, matrix):
-        """Return a matrix of the frame of the jumps in the basis of the system."""
+        """Transform a matrix from the frame of the jumps to the basis of the system."""
         return (
             matrix
             if self.jump_frame is None

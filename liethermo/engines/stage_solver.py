@@ -82,7 +82,8 @@ class IterationState(NamedTuple):
     def is_at_plateau(self, scale, options: SolverOptions, residual_norm=None, slope_rounding=None) -> jax.Array:
         """Return whether the update is negligible, or small and stalled twice (the rounding plateau).
 
-        An update is small relative to ``scale``; the residual may be small relative to ``slope_rounding`` instead.
+        An update is small relative to ``scale``. With ``slope_rounding``, a residual that is small relative to it will
+        do instead.
         """
         is_small = self.update <= options.plateau_rtol * scale
         if slope_rounding is not None:

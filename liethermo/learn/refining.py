@@ -160,7 +160,7 @@ def _is_perceptron(part: Any) -> bool:
 
 
 def pad_runs(data: list[Trajectory], states: list[np.ndarray]) -> PaddedRuns:
-    """Return trajectories and guesses of their states, shape (m, N), as arrays of one shape."""
+    """Pad trajectories, and the guesses of their states, shape (m, N) each, to one length."""
     length = max(len(t) for t, _ in data)
     rows = []
     for (t, x), trajectory_states in zip(data, states, strict=True):

@@ -47,7 +47,7 @@ MISSING_GROUP_MESSAGE = (
 
 
 def refuse_tracers(function: Callable[..., Result]) -> Callable[..., Result]:
-    """Decorate a function of numbers: if JAX traces its arguments, raise an InputError that names ``lt.flow``."""
+    """Decorate a function that needs numbers: it refuses traced arguments by an InputError that names ``lt.flow``."""
 
     @functools.wraps(function)
     def call(*arguments, **keywords) -> Result:

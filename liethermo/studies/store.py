@@ -176,7 +176,7 @@ class StudyStore:
         except FileError as error:
             if self.attributes.get("coordinates") != _coordinates_checksum(axes) or axes.shape != self.shape:
                 raise FileError(
-                    f"{error}. A study with the axes that the store was made with, in their order, writes it again"
+                    f"{error}. To write the file again, run a study with the axes of the store, in their order"
                 ) from error
         self._write_metadata(axes)
         return self.read_axes()

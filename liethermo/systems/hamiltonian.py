@@ -85,7 +85,9 @@ def _energy_of_terms(terms: Sequence, times) -> tuple[int, Energy]:
             raise InputError(f"term {i} of the Hamiltonian is a matrix, or a pair of a matrix and a function of t")
         H = checked_hermitian(H, f"term {i} of the Hamiltonian")
         if H.shape != (first_matrix := (constant + modulated + [H])[0]).shape:
-            raise InputError(f"term {i} of the Hamiltonian has shape {H.shape}, and another one {first_matrix.shape}")
+            raise InputError(
+                f"term {i} of the Hamiltonian has shape {H.shape}, but another term has shape {first_matrix.shape}"
+            )
         if f is None:
             constant.append(H)
             continue

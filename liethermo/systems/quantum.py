@@ -548,7 +548,9 @@ class QuantumSystem(System):
                 terms.append(term.replace_operators(operators, term.bath + offset))
             offset += 0 if s.baths is None else s.baths.number
         if (self.baths is None) != (other.baths is None) and all(s.dissipation is not None for s in systems):
-            raise InputError("jumps of one part have a bath and those of the other none: give both, or neither, baths")
+            raise InputError(
+                "the jumps of one part have a bath, but those of the other none: give baths to both parts or to neither"
+            )
         H = [s._constant_hamiltonian() for s in systems]
         total_H = tensor_with_identity(H[0], 0, sizes) + tensor_with_identity(H[1], 1, sizes)
         parts = self.parts + other.parts

@@ -199,7 +199,8 @@ class RotatingFrame:
 
     def _check_size(self, shape: tuple[int, ...], what: str) -> None:
         if shape != self.generator.shape:
-            raise InputError(f"{what} has shape {shape}, and the generator of the frame {self.generator.shape}")
+            generator_shape = self.generator.shape
+            raise InputError(f"{what} has shape {shape}, but the generator of the frame has shape {generator_shape}")
 
 
 class _FrameHamiltonian(Module):

@@ -191,7 +191,7 @@ class ProgramWriter:
         return widen(self.builder.trunc(x, narrow_type), self.int_type)
 
     def _call_special_function(self, op: str, args: Sequence[ir.Value]) -> ir.Value:
-        """Call a special function of SciPy lane by lane; its last argument is a flag of Cython's."""
+        """Call a special function of SciPy for each lane; the last argument is a flag that Cython adds."""
         dispatch_flag = ir.Constant(ir.IntType(32), 0)
         argument_types = [FLOAT64] * SPECIAL_FUNCTIONS[op][1] + [dispatch_flag.type]
         function = declare_symbol(self.builder.module, op, FLOAT64, argument_types)
