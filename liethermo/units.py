@@ -164,7 +164,7 @@ def quantity_in_si(text: str) -> float:
     """
     match = QUANTITY_PATTERN.fullmatch(text)
     if match is None:
-        raise InputError(f"{text!r} is no number with a unit, such as '0.5 deg/s'")
+        raise InputError(f"{text!r} is not a number with a unit, such as '0.5 deg/s'")
     return float(match[1]) * parse_unit(match[2]).factor
 
 

@@ -5,34 +5,31 @@ from __future__ import annotations
 import os
 
 import jax
+from jax._src import xla_bridge
 
 from .errors import ForkError
-
-BACKEND_COMPILE_EVENT = "/jax/core/compile/backend_compile_duration"
-"""Event that JAX reports when XLA has compiled a program."""
 
 LOWERING_EVENT = "/jax/core/compile/jaxpr_to_mlir_module_duration"
 """Event that JAX reports just before XLA compiles a program."""
 
-_has_compiled, _forked_after_compile = False, False
+_forked_after_start = False
+"""Whether this process was forked after JAX had started the threads of its backend, by an array already."""
 
 
-def _track_compilation(event: str, duration_secs: float, **kwargs: str | int) -> None:
-    global _has_compiled
+def _refuse_compilation(event: str, duration_secs: float, **kwargs: str | int) -> None:
     del duration_secs, kwargs
-    if event == LOWERING_EVENT and _forked_after_compile:
+    if event == LOWERING_EVENT and _forked_after_start:
         raise ForkError(
             "this process was forked after JAX had run, so XLA cannot compile in it. "
             'Start processes by multiprocessing.get_context("spawn")'
         )
-    _has_compiled = _has_compiled or event == BACKEND_COMPILE_EVENT
 
 
 def _mark_forked_child() -> None:
-    global _forked_after_compile
-    _forked_after_compile = _forked_after_compile or _has_compiled
+    global _forked_after_start
+    _forked_after_start = _forked_after_start or xla_bridge.backends_are_initialized()
 
 
-jax.monitoring.register_event_duration_secs_listener(_track_compilation)
+jax.monitoring.register_event_duration_secs_listener(_refuse_compilation)
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_mark_forked_child)

@@ -297,9 +297,9 @@ def parameters() -> dict[str, list[Any]]:
     for package in (liethermo, manifolds):
         for owner in (package, *(getattr(package, name) for name in package.__all__)):
             has_members = inspect.ismodule(owner) or inspect.isclass(owner)
-            members = (
-                [getattr(owner, name) for name in all_names(owner) if not name.startswith("_")] if has_members else []
-            )
+            public_names = [name for name in all_names(owner) if not name.startswith("_")] if has_members else []
+            # enumerations have names that their members alone can look up
+            members = [getattr(owner, name, None) for name in public_names]
             for member in filter(callable, (owner, *members)):
                 try:
                     names = inspect.signature(member).parameters

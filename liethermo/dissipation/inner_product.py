@@ -143,7 +143,7 @@ class KillingDissipation(BracketDissipation):
                 f"{g.name} is solvable: its Killing form vanishes on brackets, so KillingDissipation would do nothing. "
                 "Instead use ProjectedMetric() or InnerProductDissipation(K)"
             )
-        return dataclasses.replace(self, form=real_array(form))
+        return dataclasses.replace(self, form=real_array(form) if isinstance(form, np.ndarray) else form)
 
     def added_momentum(self, dH, bracket_dH_dS):
         return self.rate * (self.form @ bracket_dH_dS)

@@ -94,7 +94,7 @@ def test_a_number_with_a_unit(text, value):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"), [("deg", "no number with a unit"), ("3", "no number"), ("3 dog", "unknown")]
+    ("text", "words"), [("deg", "not a number with a unit"), ("3", "not a number"), ("3 dog", "unknown")]
 )
 def test_a_text_that_is_no_quantity_is_refused(text, words):
     with pytest.raises(lt.InputError, match=words):

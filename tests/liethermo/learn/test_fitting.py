@@ -184,7 +184,7 @@ X = np.arange(15.0).reshape(5, 3)
         ([(T, X), (T, X[:, :2])], {}, "trajectory 1: .*shape"),
         ((T, X[:, :2]), {"observed": [-1, 1]}, "component -1"),
         ((T, X), {"observed": [[0], [1, 2]]}, "sequence of different component numbers"),
-        ((T, X), {"noise": "some"}, "positive standard deviation"),
+        ((T, X), {"noise": "some"}, "not a number with a unit"),
         ((T, X), {"noise": [0.1, 0.1]}, "one for each of 3 components"),
         ((T, X), {"validation": "a fifth"}, "fraction from 0 to below 1"),
         ((T, X), {"rate": float("nan")}, "rate must be a positive number"),

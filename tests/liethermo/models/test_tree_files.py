@@ -103,7 +103,7 @@ def test_an_mjcf_file_is_the_tree_built_by_hand():
         (URDF.replace('<mass value="2"/>', '<mass value="0"/>'), "an inertia and no mass"),
         (URDF.replace("<axis xyz", "<axis ixyz"), "needs the attribute 'xyz'"),
         (URDF.replace('<parent link="yoke"/>', '<parent link="arm"/>'), "the link 'arm'"),
-        (URDF.replace("</robot>", ""), "no well-formed XML"),
+        (URDF.replace("</robot>", ""), "not well-formed XML"),
         ("<mujoco/>", "the root element 'robot'"),
     ],
 )  # fmt: skip

@@ -50,10 +50,10 @@ def test_columns_are_found_by_their_names(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "no table"),
+        ("", "not a table"),
         ("t,q_x,q_y,q_z,q_w\n", "at least one line"),
         ("t,q_x,q_y,q_z\n0,0,0,1\n", "no column 'q_w'"),
-        ("t,q_x,q_y,q_z,q_w\n0,0,0,0,a\n", "no table of numbers"),
+        ("t,q_x,q_y,q_z,q_w\n0,0,0,0,a\n", "not a table of numbers"),
         ("t,q_x,q_y,q_z,q_w\n0,0,0,0,1,2\n", "numbers in each line"),
         ("t,q_x,q_y,q_z,q_w\n0,0,0,0,1\n0,0,0,2,1\n", "norm 2.23607 in line 3"),
         ("t,q_x,q_y,q_z,q_w\n0,0,0,0,nan\n", "norm nan in line 2"),

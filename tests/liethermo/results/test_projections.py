@@ -48,7 +48,7 @@ def test_invariants_draws_each_of_them(run):
 
 def test_faults_are_named(run):
     system, solution = run
-    for coordinates, message in [([0], "2 or 3"), ([0, 9], "index from 0 to 4"), (["e1", "z"], "'z' is no name")]:
+    for coordinates, message in [([0], "2 or 3"), ([0, 9], "index from 0 to 4"), (["e1", "z"], "'z' is not the name")]:
         with pytest.raises(lt.InputError, match=message):
             lt.plot.projection(solution, coordinates, system)
     with pytest.raises(lt.InputError, match="needs system="):

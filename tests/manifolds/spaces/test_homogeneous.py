@@ -110,7 +110,7 @@ def test_functions_that_are_not_of_classes_are_refused(is_product):
         (
             lambda: mf.Homogeneous(mf.SO(3), [plane_generator(3, 0, 1), plane_generator(3, 1, 2)]),
             mf.ParameterError,
-            "no subalgebra.*add what",
+            "not a subalgebra.*add what",
         ),
         (
             lambda: mf.Homogeneous(mf.SO(3), [plane_generator(3, 0, 1)] * 2),
