@@ -13,7 +13,7 @@ LOWERING_EVENT = "/jax/core/compile/jaxpr_to_mlir_module_duration"
 """Event that JAX reports just before XLA compiles a program."""
 
 _forked_after_start = False
-"""Whether this process was forked after JAX had started the threads of its backend, by an array already."""
+"""True in a process that was forked after JAX had started the threads of its backend, which an array does."""
 
 
 def _refuse_compilation(event: str, duration_secs: float, **kwargs: str | int) -> None:
