@@ -135,20 +135,12 @@ class DeclaredTimes(NamedTuple):
         """Return the times that the functions of time in a pytree declare."""
         leaves = jax.tree_util.tree_leaves(tree, is_leaf=lambda node: isinstance(node, FunctionWithBreaks))
         functions = [leaf for leaf in leaves if isinstance(leaf, FunctionWithBreaks)]
-        jumps, kinks = ({t for f in functions for t in times(f)} for times in (_jumps_of, _kinks_of))
+        jumps, kinks = {t for f in functions for t in f.break_times}, {t for f in functions for t in f.kink_times}
         return cls(tuple(sorted(jumps)), tuple(sorted(kinks)))
 
 
 TIMES_OF_SMOOTH_FUNCTIONS = DeclaredTimes((), ())
 """The declared times of functions that are smooth."""
-
-
-def _jumps_of(function: FunctionWithBreaks) -> tuple[float, ...]:
-    return function.break_times
-
-
-def _kinks_of(function: FunctionWithBreaks) -> tuple[float, ...]:
-    return function.kink_times
 
 
 def checked_breaks(breaks) -> tuple[float, ...]:

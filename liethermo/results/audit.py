@@ -12,7 +12,7 @@ from manifolds._tables import TableRow, Tabular
 from ..engines.status_codes import StatusCode
 from ..errors import InputError
 from ..functions.gradients import EPS
-from .rounding_scale import RoundingScale
+from .rounding_scale import InvariantDrift, RoundingScale
 
 if TYPE_CHECKING:
     from .audit_evidence import Evidence
@@ -219,7 +219,7 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
     min_step_energy, max_step_energy = stats.energy_range or (np.inf, -np.inf)
     min_energy, max_energy = min(min_step_energy, float(energy.min())), max(max_step_energy, float(energy.max()))
     initial_energy = float(energy[0])
-    rounding = _rounding_scale(energy, evidence.energy, evidence.terms.get("energy"))
+    rounding = RoundingScale.from_series(energy, evidence.energy, evidence.terms.get("energy"))
     drift = float(max(max_energy - initial_energy, initial_energy - min_energy) / rounding.scale)
     allowed = float(rounding.allowed_change(tolerances.energy))
     if laws.energy == "conserved":
@@ -242,11 +242,11 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
     for name, series in solution.casimirs.items():
         if name in laws.ledger:
             continue
-        rounding = _rounding_scale(series, evidence.invariants.get(name), evidence.terms.get(name))
-        change = float(np.abs(series - series[0]).max() / rounding.scale)
+        invariant_drift = InvariantDrift.from_series(series, evidence.invariants.get(name), evidence.terms.get(name))
+        change = invariant_drift.change
         if name in laws.conserved:
             drifts.append(change)
-            rows.append(invariant_row(name, change, rounding, tolerances))
+            rows.append(invariant_row(f"drift of {name}", invariant_drift, tolerances))
         elif name in laws.unpromised:
             rows.append(AuditRow(f"drift of {name}", change, None, None, UNPROMISED_CONSTANT_NOTE))
         else:
@@ -286,9 +286,9 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
     return Audit(drift, min_entropy_increment, max(drifts, default=np.nan), stats.worst_residual, tuple(rows), coverage)
 
 
-def invariant_row(name: str, change: float, rounding: RoundingScale, tolerances: Tolerances) -> AuditRow:
-    """Return the row of a function that is conserved, from its largest change relative to its rounding scale."""
-    return _judged_row(f"drift of {name}", change, float(rounding.allowed_change(tolerances.casimirs)))
+def invariant_row(law: str, drift: InvariantDrift, tolerances: Tolerances, note: str = "") -> AuditRow:
+    """Return the row of a function that is conserved, the entropy or another one."""
+    return _judged_row(law, drift.change, drift.allowed_change(tolerances.casimirs), note)
 
 
 def _spatial_momentum_row(change: float, laws: Laws, tolerances: Tolerances) -> AuditRow:
@@ -317,18 +317,15 @@ def _entropy_row(solution: AuditedRun, tolerances: Tolerances) -> tuple[float, A
     S, law = solution.entropy, solution.laws.entropy
     assert S is not None
     note, evidence = _inexact_law_note(solution.laws, "entropy"), solution.evidence
-    rounding = _rounding_scale(S, evidence.entropy, evidence.terms.get("entropy"))
+    drift = InvariantDrift.from_series(S, evidence.entropy, evidence.terms.get("entropy"))
     min_increment = float(min([*np.diff(S), _value_or(solution.stats.least_entropy_increment, np.inf)]))
     if law == "conserved":
-        change = float(np.abs(S - S[0]).max() / rounding.scale)
-        return min_increment, _judged_row(
-            "entropy drift", change, float(rounding.allowed_change(tolerances.casimirs)), note
-        )
+        return min_increment, invariant_row("entropy drift", drift, tolerances, note)
     if law is None:
         return min_increment, AuditRow(
             "least entropy increment", min_increment, None, None, _why_no_law(solution.laws, "entropy")
         )
-    rounding = replace(rounding, value=float(np.abs(S).max()))
+    rounding = replace(drift.rounding, value=float(np.abs(S).max()))
     step_tolerance, total_tolerance = (
         float(rounding.allowed_change(t) * rounding.scale) for t in (tolerances.entropy, tolerances.casimirs)
     )
@@ -374,12 +371,6 @@ def coverage_text(evidence: Evidence, steps: int) -> str:
     """Return how many of the steps were checked; empty if all were."""
     n_checked = evidence.looked
     return "" if n_checked is None or n_checked >= steps else f"checked {n_checked:,} of {steps:,} steps"
-
-
-def _rounding_scale(series: np.ndarray, sensitivity: float | None, term_size: float | None) -> RoundingScale:
-    """Return the rounding scale of a function with these values; their maximum replaces an unknown sensitivity."""
-    known_sensitivity = float(np.abs(series).max()) if sensitivity is None else sensitivity
-    return RoundingScale(abs(float(series[0])), known_sensitivity, _value_or(term_size, 0.0))
 
 
 INEXACT_LAW_NOTE = "not kept exactly by this method"

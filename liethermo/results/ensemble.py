@@ -337,7 +337,7 @@ class Ensemble(AuditableResult):
             i = law.worst_member
             rows.append(law.audit_row(i, f"worst is trajectory {i}"))
         drifts = self.evidence.drifts
-        rows += [invariant_row(name, drift.change, drift.rounding, limits) for name, drift in drifts.items()]
+        rows += [invariant_row(f"drift of {name}", drift, limits) for name, drift in drifts.items()]
         rows += condition_rows(self.evidence)
         if self.evidence_source is not None or self.evidence.local_error is not None:
             rows.append(accuracy_row(self.evidence, limits))

@@ -33,6 +33,17 @@ class RoundingScale:
     sensitivity: Any
     term_size: Any = 0.0
 
+    @classmethod
+    def from_series(
+        cls, values: np.ndarray, sensitivity: float | None = None, term_size: float | None = None
+    ) -> RoundingScale:
+        """Return the scale of a function with these values along a run, of which the first counts.
+
+        The largest value replaces an unknown sensitivity.
+        """
+        known_sensitivity = float(np.abs(values).max()) if sensitivity is None else sensitivity
+        return cls(abs(float(values[0])), known_sensitivity, 0.0 if term_size is None else term_size)
+
     @property
     def scale(self) -> Any:
         """Scale relative to which changes of the function are given."""
@@ -65,7 +76,13 @@ class InvariantDrift:
     rounding: RoundingScale
 
     @classmethod
-    def from_series(cls, values: np.ndarray, sensitivity: float, term_size: float) -> InvariantDrift:
-        """Return the drift of a function with these values along a run, and with these largest rounding scales."""
-        rounding = RoundingScale(abs(float(values[0])), sensitivity, term_size)
+    def from_series(
+        cls, values: np.ndarray, sensitivity: float | None = None, term_size: float | None = None
+    ) -> InvariantDrift:
+        """Return the drift of a function with these values along a run; see :meth:`RoundingScale.from_series`."""
+        rounding = RoundingScale.from_series(values, sensitivity, term_size)
         return cls(float(np.abs(values - values[0]).max() / rounding.scale), rounding)
+
+    def allowed_change(self, tolerance: float) -> float:
+        """Return the largest accepted change, relative to the rounding scale."""
+        return float(self.rounding.allowed_change(tolerance))

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from ..engines.adaptive_runs import EventOccurrence
@@ -15,7 +14,6 @@ from ..engines.compiled.parameters import ProgramStructure
 from ..engines.select_engine import EngineWithFallback
 from ..engines.status_codes import StatusCode
 from ..engines.step import energy_or_entropy_that_relaxes
-from ..functions.energy import Energy
 from ..integrators import OneStepMethod
 from ..results.audit_evidence import (
     MAX_LOCAL_ERROR_STEPS,
@@ -44,7 +42,14 @@ from ..systems.states import reshape_to_sites
 from ..tracing.interpret import evaluate_at_points
 from .preparation import invariants_and_laws
 from .schedule import StepSchedule
-from .solution_builder import EngineReplay, RecordedFunctions, build_solution, velocities_at_states, velocity_names
+from .solution_builder import (
+    EngineReplay,
+    RecordedFunctions,
+    build_solution,
+    series_of_functions,
+    velocities_at_states,
+    velocity_names,
+)
 from .system_family import Family
 from .termination import ensemble_failure_message
 
@@ -327,7 +332,7 @@ class EnsembleEvidenceCollector:
         self.x, self.distance = np.ascontiguousarray(record.x0[sample]), record.quantities["distance"][sample]
         self.h, self.start_time, self.replay = record.quantities["first_step"][sample], record.schedule.start, replay
         self.n_steps_taken = record.steps[sample]
-        self.saved_states, self.saved_times = _states_for_conditions(record, sample)
+        self.saved_states, self.saved_times = _sampled_saved_states(record, sample)
         self.max_replayed_steps = max(1, min(n_equal_steps, MAX_SAMPLED_VALUES // (REPLAY_COST_RATIO * self.x.size)))
 
     @np.errstate(over="ignore", invalid="ignore")  # overflowed states have the status non_finite
@@ -405,10 +410,9 @@ class EnsembleEvidenceCollector:
         functions = {name: function for name, (function, _) in recorded.items() if name in laws.conserved}
         if not functions or not len(states):
             return {}
-        values = evaluate_at_points(_function_values, tuple(functions.values()), states)
-        scales = evaluate_at_points(rounding_scales, tuple(functions.values()), states)
-        columns = zip(values.T, *map(column_maxima, scales), strict=True)
-        return {name: InvariantDrift.from_series(*column) for name, column in zip(functions, columns, strict=True)}
+        scales = map(column_maxima, evaluate_at_points(rounding_scales, tuple(functions.values()), states))
+        columns = zip(series_of_functions(functions, states).items(), *scales, strict=True)
+        return {name: InvariantDrift.from_series(values, *maxima) for (name, values), *maxima in columns}
 
     def _known_states(self) -> Iterator[np.ndarray]:
         """Return the saved states of each trajectory of the sample up to its end; nothing if none were kept."""
@@ -426,7 +430,7 @@ class EnsembleEvidenceCollector:
         return np.asarray(self.member.points(x)).reshape(len(x), -1)
 
 
-def _states_for_conditions(
+def _sampled_saved_states(
     record: EnsembleRecord, sample: np.ndarray
 ) -> tuple[Sequence[np.ndarray] | np.ndarray, np.ndarray]:
     """Return saved states of some trajectories, shape (sample, times, n), and times that are spread over the run.
@@ -441,10 +445,6 @@ def _states_for_conditions(
         return states, np.linspace(record.schedule.start, end, MAX_SENSITIVITY_STATES)
     times = evenly_spaced_indices(record.trajectories.shape[1], MAX_SENSITIVITY_STATES)
     return record.trajectories[sample][:, times, :-2], record.saved_times[times]
-
-
-def _function_values(functions: tuple[Energy, ...], x):
-    return jnp.stack([f.value(x) for f in functions])
 
 
 def _rounding_scales_at(model: tuple[ProgramStructure, int], row):

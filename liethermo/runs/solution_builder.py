@@ -79,7 +79,7 @@ def build_solution(
     solution = Solution(
         x=x,
         entropy=None if system.entropy is None else entropy,
-        casimirs=defer(functools.partial(_series_of_functions, functions.of_series, x)),
+        casimirs=defer(functools.partial(series_of_functions, functions.of_series, x)),
         laws=laws,
         evidence_source=EvidenceCollector(
             system, method, functions.invariants, x, np.asarray(fields["t"]), step_sizes, replay
@@ -119,7 +119,8 @@ VELOCITY_FUNCTIONS: dict[str, Callable[[System, Any], Any]] = {
 """Functions of a system and a state, shape (n,), to velocities, shape (k,), by the name of the result."""
 
 
-def _series_of_functions(functions: Mapping[str, Energy], x: np.ndarray) -> dict[str, np.ndarray]:
+def series_of_functions(functions: Mapping[str, Energy], x: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the values of functions at states, shape (m, n), by their names, shape (m,) each."""
     return {name: evaluate_at_points(_function_value, function, x) for name, function in functions.items()}
 
 

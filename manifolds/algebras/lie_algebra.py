@@ -67,10 +67,8 @@ class LieAlgebra(StructureMethods):
     Examples
     --------
     >>> C = np.zeros((3, 3, 3))
-    >>> C[0, 1, 2], C[0, 2, 1] = (
-    ...     1,
-    ...     -1,
-    ... )  # [e1, e2] = e3, [e1, e3] = -e2: the motions of the plane
+    >>> C[0, 1, 2] = 1  # [e1, e2] = e3
+    >>> C[0, 2, 1] = -1  # [e1, e3] = -e2: the motions of the plane
     >>> g = mf.LieAlgebra.from_structure_constants(C - C.swapaxes(0, 1), name="plane")
     >>> print(*g.casimirs(degree=2))
     mu2**2 + mu3**2

@@ -1,6 +1,5 @@
 """Check that the check of the site finds each fault, planted in a page that is right without it."""
 
-import importlib
 import shutil
 from pathlib import Path
 
@@ -10,9 +9,8 @@ DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
 @pytest.fixture
-def check_text(monkeypatch):
-    monkeypatch.syspath_prepend(str(DOCS))
-    return importlib.import_module("check_text")
+def check_text(import_from_docs):
+    return import_from_docs("check_text")
 
 
 def test_a_table_that_stays_raw_is_found(check_text):
@@ -45,9 +43,8 @@ def test_code_wider_than_a_page_is_found(check_text, language):
     assert "89 columns" in problem
 
 
-def test_the_check_of_the_sources_finds_each_kind(monkeypatch, tmp_path):
-    monkeypatch.syspath_prepend(str(DOCS))
-    check_site = importlib.import_module("check_site")
+def test_the_check_of_the_sources_finds_each_kind(import_from_docs, tmp_path):
+    check_site = import_from_docs("check_site")
     page = tmp_path / "page.md"
     page.write_text("A text.\n")
     assert check_site.check_sources(tmp_path) == []
@@ -82,9 +79,8 @@ def test_the_pages_share_their_numbers(check_text):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("chromium"), reason="no Chromium on this machine")
-def test_what_is_clipped_is_found(monkeypatch, tmp_path):
-    monkeypatch.syspath_prepend(str(DOCS))
-    check_site = importlib.import_module("check_site")
+def test_what_is_clipped_is_found(import_from_docs, tmp_path):
+    check_site = import_from_docs("check_site")
     cell, style = "<td>" + "w" * 40 + "</td>", "style='display: block; overflow: auto; width: 900px'"
     page = f"<div class='bd-article'><table {style}><tr>{{}}</tr></table>"
     page += f"<div class='highlight'><pre {style}>{{}}</pre></div></div>"
@@ -99,9 +95,8 @@ def test_what_is_clipped_is_found(monkeypatch, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("chromium"), reason="no Chromium on this machine")
-def test_text_that_a_narrow_screen_cuts_off_is_found(monkeypatch, tmp_path):
-    monkeypatch.syspath_prepend(str(DOCS))
-    check_site = importlib.import_module("check_site")
+def test_text_that_a_narrow_screen_cuts_off_is_found(import_from_docs, tmp_path):
+    check_site = import_from_docs("check_site")
     page = "<meta name='viewport' content='width=device-width'><div style='overflow-x: {}'><div class='bd-article'>"
     page += "<p style='width: {}px'>A sentence.</p></div></div>"
     (tmp_path / "right.html").write_text(page.format("hidden", 300))

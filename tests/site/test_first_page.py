@@ -1,8 +1,6 @@
 """Check the picture of the first page, which shows runs of one body, and the line of facts above it."""
 
-import importlib
 import math
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -11,13 +9,10 @@ import pytest
 
 import liethermo as lt
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
-
 
 @pytest.fixture
-def chart_module(monkeypatch):
-    monkeypatch.syspath_prepend(str(DOCS))
-    return importlib.import_module("beside")
+def chart_module(import_from_docs):
+    return import_from_docs("beside")
 
 
 def test_the_others_solve_the_equations_of_the_library(chart_module):
@@ -47,9 +42,8 @@ def _bar(q):
     return np.array([q[0], *-q[1:]])
 
 
-def test_the_line_of_facts_names_the_version_of_the_package(monkeypatch, tmp_path):
-    monkeypatch.syspath_prepend(str(DOCS))
-    facts = importlib.import_module("facts")
+def test_the_line_of_facts_names_the_version_of_the_package(import_from_docs, monkeypatch, tmp_path):
+    facts = import_from_docs("facts")
     monkeypatch.setenv("GITHUB_REPOSITORY", "some/one")
     facts.write_facts(tmp_path / "facts.md")
     line = (tmp_path / "facts.md").read_text()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import importlib
 import re
 import tomllib
 from pathlib import Path
@@ -102,9 +101,8 @@ def test_a_line_that_does_not_work_is_found(target):
     assert _fault_of_command(found)
 
 
-def test_the_citation_has_what_the_file_has(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "docs"))
-    facts = importlib.import_module("facts")
+def test_the_citation_has_what_the_file_has(import_from_docs):
+    facts = import_from_docs("facts")
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     bibtex = facts.bibtex(citation)
     one_line_each = " ".join(bibtex.split())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 from pathlib import Path
 
@@ -31,9 +30,8 @@ def test_both_indices_have_a_card_for_every_start_page():
         assert {page.stem for page in FIELDS} <= cards, index
 
 
-def test_every_picture_of_a_card_is_drawn_and_shown(monkeypatch):
-    monkeypatch.syspath_prepend(str(DOCS))
-    cards = importlib.import_module("cards")
+def test_every_picture_of_a_card_is_drawn_and_shown(import_from_docs):
+    cards = import_from_docs("cards")
     drawn_names = {page.rpartition("/")[2] for page in cards.FIGURES}
     assert drawn_names == {path.stem for path in cards.CARDS.glob("*.png")}
     assert drawn_names == {name for page in PAGES for name in CARD.findall(page.read_text())}

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 import json
-from pathlib import Path
 from types import SimpleNamespace
 
 import matplotlib
 import pytest
-
-DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 PAGE = """# Title
 
@@ -37,16 +33,14 @@ The end.
 
 
 @pytest.fixture
-def page_runner(monkeypatch):
-    monkeypatch.syspath_prepend(str(DOCS / "_ext"))
+def page_runner(import_from_docs):
     matplotlib.use("Agg")
-    return importlib.import_module("executed")
+    return import_from_docs("executed", "_ext")
 
 
 @pytest.fixture
-def build_note(monkeypatch):
-    monkeypatch.syspath_prepend(str(DOCS / "_ext"))
-    return importlib.import_module("made_by")
+def build_note(import_from_docs):
+    return import_from_docs("made_by", "_ext")
 
 
 def build(page_runner, text, folder):
