@@ -164,6 +164,16 @@ def test_docstrings_begin_with_a_subject_or_a_verb():
     assert not faults, "\n".join(f"{n.path.relative_to(ROOT)}:{n.line}: {n.name}" for n in faults)
 
 
+def test_code_in_docstrings_has_both_its_backquotes():
+    faults = [
+        f"{path.relative_to(ROOT)}: {paragraph.strip()[:80]}"
+        for path in MODULES
+        for paragraph in paragraphs_of_module(path.read_text())
+        if paragraph.count("``") % 2 or paragraph.replace("``", "").count("`") % 2
+    ]
+    assert not faults, "\n".join(faults)
+
+
 def test_locals_are_plain_in_every_room():
     rooms = collections.defaultdict(collections.Counter)
     for n in names_of_kind("local"):

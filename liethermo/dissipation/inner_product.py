@@ -26,9 +26,9 @@ class BracketDissipation(Dissipation):
         return g.ad_star(dH, self.added_momentum(dH, g.bracket(dH, dS)))
 
     def rate_of_change(self, system, x, dH, dS, dL, gradient):
-        """Return the rate ``F . [dH, gradient]`` of a function with this gradient, from one bracket for both uses.
+        """Return the rate ``F . [dH, gradient]`` of a function with this gradient.
 
-        [dH, gradient]``; for the entropy, the bracket is the same one that F is made of.
+        For the entropy, the bracket is the one that F is made of, and is computed once.
         """
         action = system.algebra.action(dH)
         return action.bracket(gradient) @ self.added_momentum(dH, action.bracket(dS))

@@ -79,15 +79,19 @@ class IterationState(NamedTuple):
         """
         return (self.update > rate * self.previous_update) & (self.update > rate * rate * self.earlier_update)
 
-    def is_at_plateau(self, scale, options: SolverOptions, residual_norm=None, slope_rounding=None) -> jax.Array:
-        """Return whether the update is negligible, or small and stalled twice (the rounding plateau).
+    def is_small(self, scale, options: SolverOptions, residual_norm=None, slope_rounding=None) -> jax.Array:
+        """Return whether the update is as small relative to ``scale`` as rounding may leave it.
 
-        An update is small relative to ``scale``. With ``slope_rounding``, a residual that is small relative to it will
-        do instead.
+        With ``slope_rounding``, a residual that is small relative to it will do instead.
         """
         is_small = self.update <= options.plateau_rtol * scale
         if slope_rounding is not None:
             is_small |= residual_norm <= options.plateau_rtol * slope_rounding
+        return is_small
+
+    def is_at_plateau(self, scale, options: SolverOptions, residual_norm=None, slope_rounding=None) -> jax.Array:
+        """Return whether the update is negligible, or small and stalled twice (the rounding plateau)."""
+        is_small = self.is_small(scale, options, residual_norm, slope_rounding)
         return (self.update <= options.update_floor * scale) | ((self.n_stalled >= 2) & is_small)
 
     def has_converged_and_continues(self, scale, options: SolverOptions) -> tuple[jax.Array, jax.Array]:
@@ -161,13 +165,17 @@ def solve_newton(
     def evaluate_residual(k):
         return slopes(k) - k
 
-    def has_failed(s: IterationState, is_damped):
-        return (s.n_iterations >= jnp.where(is_damped, 2, 1) * options.max_newton_iterations) | ~jnp.isfinite(
-            jnp.sum(s.k)
-        )
+    def is_at_limit(s: IterationState, is_damped):
+        return s.n_iterations >= jnp.where(is_damped, 2, 1) * options.max_newton_iterations
 
-    def is_unsolved(s: IterationState, residual):
-        return jnp.logical_not(is_solved) & ~s.is_at_plateau(scale(s.k), options, norm(residual), slope_rounding)
+    def has_failed(s: IterationState, is_damped):
+        return is_at_limit(s, is_damped) | ~jnp.isfinite(jnp.sum(s.k))
+
+    def is_unsolved(s: IterationState, residual, is_damped):
+        """Return whether the iteration has not converged; at the limit it may still shrink below rounding."""
+        criteria = scale(s.k), options, norm(residual), slope_rounding
+        converged = s.is_at_plateau(*criteria) | (is_at_limit(s, is_damped) & s.is_small(*criteria))
+        return jnp.logical_not(is_solved) & ~converged
 
     def damp_newton_step(k, step, residual_norm, smallest_step_norm, is_damped):
         """Return k minus the (halved) step, the residual there, and whether the step is a full one."""
@@ -212,7 +220,7 @@ def solve_newton(
                 (n_uses < options.max_jacobian_reuse)
                 & ~(inner.update > options.jacobian_contraction_limit * inner.previous_update)
             )
-            return is_fresh & is_unsolved(inner, residual) & ~has_failed(inner, is_damped)
+            return is_fresh & is_unsolved(inner, residual, is_damped) & ~has_failed(inner, is_damped)
 
         s, residual, _ = jax.lax.while_loop(
             can_reuse_jacobian, newton_iteration, (s, residual, jnp.zeros_like(s.n_iterations))
@@ -221,13 +229,13 @@ def solve_newton(
 
     def is_unfinished(carry):
         s, residual, is_damped = carry
-        return is_unsolved(s, residual) & ~(is_damped & has_failed(s, is_damped))
+        return is_unsolved(s, residual, is_damped) & ~(is_damped & has_failed(s, is_damped))
 
     initial_k, initial_residual = best_guess_and_residual(evaluate_residual, guess)
-    s, residual, _ = jax.lax.while_loop(
+    s, residual, is_damped = jax.lax.while_loop(
         is_unfinished, newton_cycle, (IterationState.initial(initial_k), initial_residual, jnp.asarray(False))
     )
-    converged = ~is_unsolved(s, residual) & jnp.isfinite(jnp.sum(s.k))
+    converged = ~is_unsolved(s, residual, is_damped) & jnp.isfinite(jnp.sum(s.k))
     slope_rounding = jnp.where(s.is_at_plateau(scale(s.k), options), 0.0, slope_rounding)
     return StageSolution(
         s.k, converged, jnp.isfinite(s.update), s.update, n_fixed_point, s.n_iterations, slope_rounding

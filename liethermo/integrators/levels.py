@@ -355,7 +355,7 @@ def level_correction(
 def correction_displacement(system: System, x, correction, leaf: bool = False) -> jax.Array:
     """Return the displacement of x by a correction: the correction itself, or along a leaf that of its covector.
 
-    Pi K = -(Pi dH) . K`` gives the sign of K.
+    The covector is minus the correction: ``dH . Pi K = -(Pi dH) . K`` gives its sign.
     """
     return system.poisson.leaf_displacement(x, -correction) if leaf else correction
 

@@ -97,8 +97,7 @@ def checked_inertia(inertia, allow_rod: bool = False) -> np.ndarray | jax.Array:
 def warn_of_impossible_moments(moments: np.ndarray) -> None:
     """Warn if no rigid body has the first of the moments, shape (..., 3), that break the triangle inequalities."""
     rows = moments.reshape(-1, 3)
-    max_moments = rows.max(axis=-1)
-    is_impossible = max_moments > (rows.sum(axis=-1) - max_moments) * (1.0 + INEQUALITY_RTOL)
+    is_impossible = ~_obey_triangle_inequalities(rows)
     if not is_impossible.any():
         return
     row = rows[int(np.argmax(is_impossible))]
@@ -259,5 +258,10 @@ def is_symmetric(blocks: np.ndarray) -> bool:
 
 def satisfies_triangle_inequalities(moments: np.ndarray) -> bool:
     """Return True if moments of shape (..., 3) obey ``I_i <= I_j + I_k``, as the moments of every rigid body do."""
-    max_moment = moments.max(axis=-1)
-    return bool((max_moment <= (moments.sum(axis=-1) - max_moment) * (1.0 + INEQUALITY_RTOL)).all())
+    return bool(_obey_triangle_inequalities(moments).all())
+
+
+def _obey_triangle_inequalities(moments: np.ndarray) -> np.ndarray:
+    """Return which of the moments of shape (..., 3) are those of a rigid body; NaN are those of none."""
+    max_moments = moments.max(axis=-1)
+    return max_moments <= (moments.sum(axis=-1) - max_moments) * (1.0 + INEQUALITY_RTOL)

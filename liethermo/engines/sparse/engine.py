@@ -108,7 +108,7 @@ class SparseEngine:
         s, needs_jacobian = IterationState.initial(k), float(h) != self._factored_step_size
         slope_rounding = jnp.zeros(())
         while (
-            not self._is_at_plateau(s, scale, residual, slope_rounding)
+            not self._has_converged(s, scale, residual, slope_rounding)
             and int(s.n_iterations) < SPARSE_SOLVER_OPTIONS.max_newton_iterations
         ):
             if needs_jacobian or self._inverse is None:
@@ -139,7 +139,7 @@ class SparseEngine:
         is_finite = bool(jnp.isfinite(residual).all())
         return StageSolution(
             k=s.k,
-            converged=jnp.asarray(self._is_at_plateau(s, scale, residual, slope_rounding) and is_finite),
+            converged=jnp.asarray(self._has_converged(s, scale, residual, slope_rounding) and is_finite),
             is_finite=jnp.asarray(is_finite),
             residual=s.update,
             fixed_point_iterations=jnp.asarray(n_fixed_point),
@@ -148,8 +148,10 @@ class SparseEngine:
         )
 
     @staticmethod
-    def _is_at_plateau(s: IterationState, scale, residual, slope_rounding) -> bool:
-        return bool(s.is_at_plateau(scale, SPARSE_SOLVER_OPTIONS, jnp.max(jnp.abs(residual)), slope_rounding))
+    def _has_converged(s: IterationState, scale, residual, slope_rounding) -> bool:
+        criteria = scale, SPARSE_SOLVER_OPTIONS, jnp.max(jnp.abs(residual)), slope_rounding
+        is_at_limit = int(s.n_iterations) >= SPARSE_SOLVER_OPTIONS.max_newton_iterations
+        return bool(s.is_small(*criteria) if is_at_limit else s.is_at_plateau(*criteria))
 
     def _damped_newton_step(
         self, state, h, s: IterationState, residual, scale, inverse: SparseInverse, max_trials: int

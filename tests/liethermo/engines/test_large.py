@@ -13,7 +13,7 @@ from liethermo.dissipation.base import Dissipation
 from liethermo.engines import array_engine
 from liethermo.engines.krylov import solve_krylov
 from liethermo.engines.solver_options import DEFAULT_OPTIONS
-from liethermo.engines.stage_solver import IterationState, StageEquations, solve_stages
+from liethermo.engines.stage_solver import IterationState, StageEquations, solve_newton, solve_stages
 from liethermo.engines.step import initial_run_state_program
 from liethermo.runs.preparation import checked_initial_state, prepare_system_and_method
 
@@ -191,6 +191,23 @@ def test_it_is_said_where_the_equations_are_not_solved():
     few_iterations = replace(DEFAULT_OPTIONS, max_krylov_products=2, max_newton_iterations=2, max_newton_halvings=0)
     assert not bool(solve_matrix_free(slopes, guess, few_iterations).converged)
     assert not bool(solve_matrix_free(lambda k: 2.0 * k * k + 1.0, guess).converged)  # it has no solution
+
+
+@pytest.mark.parametrize(("contraction", "converges"), [(0.55, True), (0.75, False)])
+def test_newton_iteration_that_shrinks_to_rounding_at_its_limit_has_converged(contraction, converges):
+    """60 iterations shrink the update by 0.55**60 = 3e-16, and by 0.75**60 = 3e-8."""
+    solution = jnp.array([[1.0, -2.0, 0.5]])
+    equations = StageEquations(
+        lambda k: solution,
+        jnp.zeros_like(solution),
+        lambda k: 1.0 + jnp.abs(k).max(),
+        lambda k: lambda residual: (contraction - 1.0) * residual,
+    )
+    result = solve_newton(equations, DEFAULT_OPTIONS)
+    assert bool(result.converged) == converges
+    if converges:
+        assert int(result.newton_iterations) == DEFAULT_OPTIONS.max_newton_iterations
+        assert np.abs(np.asarray(result.k - solution)).max() < 1e-14
 
 
 @pytest.mark.slow

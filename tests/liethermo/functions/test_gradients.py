@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 import liethermo as lt
 from liethermo.functions.checks import with_polynomial_degrees
 from liethermo.functions.energy import make_energy
-from liethermo.functions.gradients import DISCRETE_GRADIENTS, stage_gradients
+from liethermo.functions.gradients import (
+    DISCRETE_GRADIENTS,
+    CorrectionDirection,
+    FunctionChange,
+    correct_gradients,
+    stage_gradients,
+)
 from liethermo.integrators.tableaus import gauss_tableau, kronrod_rule
 from tests.cases import EPS, energy_of
 
@@ -219,3 +225,17 @@ def test_derivatives_at_stages_of_a_step_that_vanishes(stages, length):
 
     expected = np.einsum("ij,ab->iajb", h * A, np.diag([-1.0, -0.5]))
     np.testing.assert_allclose(stage_jacobian(jnp.full((stages, 2), length)), expected, atol=1e-15)
+
+
+@pytest.mark.parametrize(("variation", "is_corrected"), [(0.1, True), (1e-5, False)])
+def test_a_defect_below_its_noise_is_corrected_where_the_gradient_varies(variation, is_corrected):
+    """Over many steps such defects add up; without variation the quadrature is exact and the defect is noise alone."""
+    b, h, k = jnp.array([0.5, 0.5]), 0.1, jnp.array([[1.0, 0.2], [0.8, 0.1]])
+    gradients = jnp.array([[1.0, 2.0], [1.0, 2.0]])
+    quadrature = h * jnp.dot(b, jnp.sum(gradients * k, axis=1))
+    change = FunctionChange(quadrature + 1e-15, jnp.asarray(1e-14), gradients)
+    corrected = correct_gradients(
+        change, gradients, k, CorrectionDirection.of(k, b), h, b, gradient_variation=variation
+    )
+    correction = float(h * jnp.dot(b, jnp.sum((corrected - gradients) * k, axis=1)))
+    assert correction == pytest.approx(1e-15 if is_corrected else 0.0, abs=3e-16)

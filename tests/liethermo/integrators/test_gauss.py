@@ -8,7 +8,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.integrators.tableaus import gauss_tableau
-from tests.cases import EPS, TRANSCENDENTAL, slow_case
+from tests.cases import EPS, TRANSCENDENTAL, energy_of, slow_case
 from tests.liethermo import random_systems
 from tests.liethermo.integrators.test_orders import NONLINEAR
 
@@ -392,3 +392,16 @@ def test_casimirs_whose_gradients_depend_on_each_other():
     run = lt.integrate(body, x0, (0.0, 0.5), 0.005, lt.MetriplecticGauss(2))
     assert run.audit().passed
     assert max(np.ptp(values) for values in run.casimirs.values()) <= 2e-15 * np.dot(x0, x0)
+
+
+def test_a_force_that_heats_a_bath_keeps_the_energy_while_cubic_casimirs_are_projected_off_it():
+    g = mf.sl(3)
+    system = lt.LiePoissonSystem(
+        g, energy_of(g.dim, 0), None, lt.DoubleBracket(0.3), baths=lt.HeatBaths(capacity=2.0, temperature=1.0)
+    )
+    x0 = system.state(np.random.default_rng(0).standard_normal(g.dim))
+    solution = lt.integrate(system, x0, (0.0, 1.0), 0.1, lt.MetriplecticGauss(2), engine="array")
+    assert np.ptp(solution.energy) <= 1e-13 * np.abs(solution.energy).max()
+    for values in solution.casimirs.values():
+        assert np.ptp(values) <= 1e-12 * np.abs(values).max()
+    assert solution.entropy[-1] > solution.entropy[0] + 1e-3

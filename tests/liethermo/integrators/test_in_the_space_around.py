@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ from scipy.integrate import solve_ivp
 import liethermo as lt
 import manifolds as mf
 from liethermo.integrators import InCharts
+from liethermo.integrators.levels import project_implicit_step
 from liethermo.runs.preparation import prepare_system_and_method
 from tests.manifolds.spaces.test_own_spaces import Ellipsoid
 
@@ -271,3 +274,12 @@ def test_gradient_flows_run_along_the_geodesics_of_geomstats(space, theirs):
     exact = np.array([metric.exp(np.exp(-t) * metric.log(x0, p), p) for t in run.t])
     assert np.abs(system.points(run.x) - exact).max() < 1e-11
     assert run.audit().passed
+
+
+@pytest.mark.parametrize(("residual", "is_kept"), [(1e-13, True), (1e-11, False)])
+def test_an_implicit_step_that_stays_off_the_surface_has_failed(residual, is_kept):
+    no_laws = SimpleNamespace(energy=None, energy_law=None, entropy=None, entropy_law=None)
+    surface = SimpleNamespace(project_displacement=lambda x, compensation, d: (d, residual * jnp.linalg.norm(x)))
+    x, d = jnp.array([3.0, 4.0]), jnp.array([0.1, 0.2])
+    projected = project_implicit_step(no_laws, surface, [], x, jnp.zeros(2), d)
+    assert bool(jnp.all(projected == d)) if is_kept else bool(jnp.isnan(projected).all())

@@ -16,6 +16,8 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.learn import files, training
 from liethermo.learn.data import Trajectory, estimate_noise
+from liethermo.learn.least_squares import MAX_STEP_BIAS, MIN_RELATIVE_BIAS, _is_negligible
+from liethermo.learn.refining import LeastSquaresResult
 
 pytest.importorskip("optax")
 
@@ -230,3 +232,32 @@ def test_the_findings_come_back_from_a_file(tmp_path):
         warnings.simplefilter("error")
         assert "matching" in str(old)
     assert len(jax.tree_util.tree_leaves(fitted_system)) == len(jax.tree_util.tree_leaves(spring(1.0)))
+
+
+@pytest.mark.parametrize(
+    ("shift", "std", "is_negligible"),
+    [
+        (0.9 * MAX_STEP_BIAS * 0.2, 0.2, True),
+        (1.1 * MAX_STEP_BIAS * 0.2, 0.2, False),
+        (0.9 * MIN_RELATIVE_BIAS * 5.0, 0.0, True),
+        (1.1 * MIN_RELATIVE_BIAS * 5.0, 0.0, False),
+        (100.0, np.inf, True),  # the data do not determine it
+    ],
+)
+def test_steps_are_short_enough_where_shorter_ones_hardly_change_the_parameters(shift, std, is_negligible):
+    """The change is judged by the standard error of a parameter, or relative to the parameter, which is 5."""
+    result = LeastSquaresResult(
+        weights=np.array([1.0, 5.0]),
+        covariance=np.diag([1.0, std**2]),
+        rank=2,
+        condition=1.0,
+        residual=1.0,
+        held_out_residual=np.nan,
+        gradient_norm=0.0,
+        converged=True,
+        iterations=3,
+        degrees_of_freedom=10,
+        states=np.zeros((1, 2, 3)),
+        mean_squares=np.ones(1),
+    )
+    assert _is_negligible(np.array([0.0, shift]), result, np.array([False, False])) == is_negligible

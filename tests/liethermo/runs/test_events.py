@@ -9,6 +9,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines import step_control
+from liethermo.engines.root_bracket import first_event_ends
 from tests.systems import oscillator, rigid_body
 
 METHODS = [lt.MetriplecticGauss(3), lt.MetriplecticRungeKutta(8), lt.MetriplecticTaylor(20)]
@@ -406,3 +407,9 @@ def test_files_have_the_events(tmp_path):
             assert np.array_equal(values, loaded_values)
             assert len(values) in (2, 4)
     assert lt.load(lt.integrate(oscillator(), [1.0, 0.0], (0.0, 1.0), 0.1).save(tmp_path / "plain.nc")).events == ()
+
+
+def test_event_functions_that_are_nan_at_the_end_of_a_step_have_no_event_in_it():
+    start, end = first_event_ends((0, 0), jnp.array([1.0, 2.0]), jnp.array([jnp.nan, -1.0]))
+    assert (float(start), float(end)) == (1.0, -0.5)  # the second function, divided by its value at the start
+    assert float(first_event_ends((0, 0), jnp.array([1.0, 2.0]), jnp.array([jnp.nan, 0.5]))[1]) == 0.25
