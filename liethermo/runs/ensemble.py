@@ -14,7 +14,7 @@ from manifolds._precision import with_library_settings
 from ..engines.select_engine import is_worth_compiling, warn_of_fallback
 from ..errors import InputError
 from ..functions.time_span import DeclaredTimes
-from ..integrators import DEFAULT_METHOD, OneStepMethod
+from ..integrators import OneStepMethod
 from ..integrators.fluctuating import noise_dimension
 from ..results.ensemble import Ensemble
 from ..systems import System
@@ -25,9 +25,11 @@ from .adaptive_ensemble import AdaptiveEnsembleRun
 from .ensemble_lanes import MAX_THREADS, FixedEnsembleRun, ProgressCounter, replay_steps
 from .events import EventSet, Until
 from .member_groups import common_inertia, group_members_by_invariants, members_outside_domain
-from .noise import DEFAULT_NOISE_METHOD, Fluctuations, NoisePaths, check_noise
+from .noise import Fluctuations, NoisePaths, check_noise
 from .preparation import (
     check_choice,
+    check_steps,
+    checked_method,
     initial_state,
     is_driven_run,
     limit_family_to_span,
@@ -128,21 +130,15 @@ def ensemble(
     ((100,), True)
     """
     start_time = time.perf_counter()
-    method = (DEFAULT_METHOD if noise is None else DEFAULT_NOISE_METHOD) if method is None else method
-    if not isinstance(method, OneStepMethod):
-        raise InputError(f"method must be an integrator such as lt.MetriplecticGauss(), got {method!r}")
+    method = checked_method(method, noise)
     outputs = outputs or ("final" if save_at is None else "trajectory")
     check_choice("outputs", outputs, ("final", "trajectory", "summary"))
     check_choice("engine", engine, ("auto", "array", "compiled"))
     if save_at is not None and outputs != "trajectory":
         raise InputError(f'save_at needs outputs="trajectory", got {outputs!r}')
-    has_step_control = isinstance(step, Adaptive) or until is not None
-    if has_step_control and outputs == "trajectory" and save_at is None:
+    if (isinstance(step, Adaptive) or until is not None) and outputs == "trajectory" and save_at is None:
         raise InputError('outputs="trajectory" with adaptive steps or events needs save_at, common times to save')
-    if has_step_control and noise is not None:
-        raise InputError(
-            "noise= needs fixed steps and cannot be combined with Adaptive or until. Give the step as a number"
-        )
+    check_steps(method, step, noise, until)
     family = Family.from_arguments(system, parameters)
     save_every_step = save_every if outputs == "trajectory" and save_at is None else None
     declared = DeclaredTimes.from_tree(family.with_unknown_parameters())

@@ -14,12 +14,12 @@ from manifolds._precision import with_library_settings
 from ..engines.select_engine import EngineWithFallback
 from ..engines.step_control import DEADBAND, largest_growth_rate_by_arnoldi
 from ..errors import InputError, LiethermoError
-from ..integrators import DEFAULT_METHOD, MetriplecticGauss, MetriplecticRungeKutta, MetriplecticTaylor, OneStepMethod
+from ..integrators import MetriplecticGauss, MetriplecticRungeKutta, MetriplecticTaylor, OneStepMethod
 from ..integrators.taylor import order_for_tolerance
 from ..systems import System
 from .adaptive import Adaptive, make_step_control
 from .adaptive_run import AcceptedSteps, RunOutcome, advance_to_end
-from .preparation import checked_initial_state, prepare_for_method
+from .preparation import checked_initial_state, checked_method, prepare_for_method
 
 
 @with_library_settings
@@ -55,7 +55,7 @@ def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod |
     >>> bool(0.01 < step < 2.0)
     True
     """
-    return _try_method(system, x0, rtol, DEFAULT_METHOD if method is None else method, t0).step
+    return _try_method(system, x0, rtol, checked_method(method), t0).step
 
 
 @dataclass(frozen=True)
