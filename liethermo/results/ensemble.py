@@ -21,12 +21,12 @@ from .audit import (
     AuditRow,
     Tolerances,
     accuracy_row,
+    check_laws,
     condition_rows,
     coverage_text,
     invariant_row,
 )
 from .audit_evidence import AuditableResult, Evidence, copies_of_velocities
-from .ensemble_laws import evaluate_ensemble_laws
 from .events import Events
 from .netcdf import (
     ENSEMBLE_FORMAT,
@@ -331,14 +331,12 @@ class Ensemble(AuditableResult):
             If the name of a tolerance is unknown, or a tolerance is negative.
         """
         limits = Tolerances.with_defaults(energy=energy, entropy=entropy, **tolerances)
-        has_stepped, terms = self.steps > 0, self.evidence.terms
-        rows = []
-        for law in evaluate_ensemble_laws(self, self.laws, limits, terms.get("energy", 0.0), terms.get("entropy", 0.0)):
-            i = law.worst_member
-            rows.append(law.audit_row(i, f"worst is trajectory {i}"))
-        drifts = self.evidence.drifts
+        has_stepped, drifts = self.steps > 0, self.evidence.drifts
+        checks = check_laws(self, self.laws, limits, self.evidence.terms, self.entropy is not None)
+        worst = [(check, int(np.argmax(check.excess))) for check in checks]
+        *rows, residual_row = (check.audit_row(i, f"worst is trajectory {i}") for check, i in worst)
         rows += [invariant_row(f"drift of {name}", drift, limits) for name, drift in drifts.items()]
-        rows += condition_rows(self.evidence)
+        rows += [residual_row, *condition_rows(self.evidence)]
         if self.evidence_source is not None or self.evidence.local_error is not None:
             rows.append(accuracy_row(self.evidence, limits))
         n_failed = int((~self.ok & (self.status != StatusCode.INTERRUPTED)).sum())
