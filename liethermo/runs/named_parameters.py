@@ -81,7 +81,7 @@ def replace_parameters(system: System, values: Mapping[str, Any]) -> System:
 
 
 def arrays_with_members(system: System, values: Mapping[str, Any]) -> list[np.ndarray]:
-    """Return the arrays of a family of systems, members along the first axis, from values of some parameters by name.
+    """Return the arrays of a family of systems, members along the first axis, for given values of some parameters.
 
     Arrays that all members share have a first axis of length 1.
 

@@ -106,7 +106,7 @@ class Problem:
     def engine(
         self, requested_engine: str, system: System, planned_steps: int, noise_increments: Callable | None = None
     ) -> EngineWithFallback:
-        """Return an engine for a run in this thread; runs share it unless it belongs to one span or one path.
+        """Return the engine of a run in this thread: a shared one, or a new one if it serves one span or path.
 
         Parameters
         ----------

@@ -202,7 +202,7 @@ class Propagator:
                 run.run_adaptive_or_until_event(bar, step if adaptive else schedule.h, until)
             else:
                 run.run_fixed(bar)
-        solution = run.solution()
+        solution = run.solution_so_far()
         if save_to is not None:
             try:
                 solution.save(save_to)
@@ -302,7 +302,7 @@ class Propagator:
     def _schedule(
         self, t_span, save_every: int, save_at, allow_infinite_end: bool, breaks, declared: DeclaredTimes
     ) -> StepSchedule:
-        """Return the schedule of a run; short ones that were used last are held in memory."""
+        """Return the schedule of a run; short schedules are cached, and those used last are kept."""
         if save_at is not None or allow_infinite_end or np.size(breaks) or any(declared) or type(save_every) is not int:
             return make_schedule(t_span, self.step, save_every, save_at, allow_infinite_end, breaks, declared)
         key = *checked_span(t_span), save_every
