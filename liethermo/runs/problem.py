@@ -43,6 +43,8 @@ class Problem:
         Whether functions of the system depend on time.
     state_shape : tuple of int
         Shape of a state: (n,), or (*sites, d).
+    has_fixed_domain : bool
+        Whether runs may start at the same states whatever the parameters of the system are.
     starts_anywhere : bool
         Whether every finite array of shape (n,) is an initial state.
     """
@@ -55,13 +57,16 @@ class Problem:
         self._engines = _ThreadEngines()
         self.state_shape = system.shape if system.sites else (system.dim,)
         kind = type(system)
-        self.starts_anywhere = (
+        self.has_fixed_domain = (
             system.space is None
+            and kind.outside is SystemInterface.outside
+            and kind.why_singular is SystemInterface.why_singular
+        )
+        self.starts_anywhere = (
+            self.has_fixed_domain
             and not self.is_driven
             and kind.state_array is System.state_array
             and not isinstance(system, AttitudeSystem)
-            and kind.outside is SystemInterface.outside
-            and kind.why_singular is SystemInterface.why_singular
         )
 
     @classmethod
