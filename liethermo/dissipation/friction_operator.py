@@ -101,8 +101,10 @@ class FrictionOperator(Dissipation):
         return self.rate * (image - jnp.dot(dH, image) * direction)
 
     def factor(self, system, x, dH, dL):
-        """Return the factor ``P^T B`` with ``B B^T = K``: B is the symmetric root of K(x), or Cholesky for constant
-        K."""
+        """Return the factor ``P^T B`` of the operator ``P^T K P``, where ``B B^T = K``.
+
+        B is the symmetric root of K(x), or the Cholesky factor of a constant K.
+        """
         root = semidefinite_root(self.K(x)) if callable(self.K) else semidefinite_factor(self.K)
         direction = self._projection_direction(system, x, dH)
 

@@ -213,7 +213,7 @@ class ThermalJumps(Dissipation):
         bath_terms = None
         if not self.is_isolated:
             # Differences of levels lose no digits; the off-diagonal entries of H are mostly zero.
-            levels, off_diagonal = self._energy_levels(structure, dH[:n]), 1.0 - np.eye(structure.size)
+            levels, off_diagonal = self._energies_in_jump_frame(structure, dH[:n]), 1.0 - np.eye(structure.size)
             H_commutators = V * (levels[None, :] - levels[:, None]) + commutator(V, H * off_diagonal)
             bath_terms = (dS[n + self.bath] * H_commutators - omega[:, None, None] * V) / T
         image = friction_image(rho, logs, A, V, omega / (2.0 * T), bath_terms)
@@ -286,7 +286,7 @@ class ThermalJumps(Dissipation):
         operators, off_diagonal, levels = (
             _stack_operators(self.jumps),
             1.0 - np.eye(structure.size),
-            self._energy_levels(structure, dH),
+            self._energies_in_jump_frame(structure, dH),
         )
         weights = np.abs(operators) ** 2
         squares = np.sum(weights, axis=(-2, -1))
@@ -295,7 +295,7 @@ class ThermalJumps(Dissipation):
         rest = off_diagonal * commutator(adjoint(operators), operators) / squares[:, None, None]
         return omega + structure.vector(self._from_jump_frame(rest)) @ dH if rest.any() else omega
 
-    def _energy_levels(self, structure: mf.DensityMatrices, dH) -> jax.Array:
+    def _energies_in_jump_frame(self, structure: mf.DensityMatrices, dH) -> jax.Array:
         """Return the diagonal of H in the frame of the jumps, shape (N,)."""
         if self.jump_frame is None:
             return dH[: structure.size]
@@ -318,7 +318,7 @@ class ThermalJumps(Dissipation):
         levels that no jump connects do not matter, however large their energies are.
         """
         order, size = np.array(self.level_order), structure.size
-        levels = self._energy_levels(structure, dH)[order]
+        levels = self._energies_in_jump_frame(structure, dH)[order]
         populations = force[:size] if self.jump_frame is None else jnp.diagonal(drho).real
         rate = jnp.dot(levels[:-1] - levels[1:], np.tri(size - 1, size) @ populations[order])
         if self.jump_frame is None:

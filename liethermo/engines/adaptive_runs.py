@@ -31,7 +31,7 @@ from .step_control import (
     initial_adaptive_state_program,
     largest_growth_rate_by_arnoldi,
     max_growth_rates,
-    max_step_times_growth_rate,
+    max_step_times_growth_rate_for_accuracy,
 )
 
 
@@ -280,7 +280,7 @@ class PauseHandler:
         """Return the indices of the trajectories that pause for ``reason``."""
         return np.flatnonzero(self.adaptive_runs.read("status") == reason)
 
-    def confirm_events(self) -> None:
+    def decide_sign_changes(self) -> None:
         """Decide for each trajectory paused at a sign change whether it is an event: a zero, to rounding.
 
         The run ends at the last zero that it waits for. Otherwise it resumes, as it does after a jump or a pole. If a
@@ -401,7 +401,10 @@ class PauseHandler:
                 ]
             )
         max_steps = np.divide(
-            max_step_times_growth_rate(self.method), rates, out=np.full(len(rates), np.inf), where=rates > 0.0
+            max_step_times_growth_rate_for_accuracy(self.method),
+            rates,
+            out=np.full(len(rates), np.inf),
+            where=rates > 0.0,
         )
         runs.write("growth_rate", indices, rates)
         runs.write("next_step_size", indices, np.minimum(runs.read("next_step_size", indices), max_steps))

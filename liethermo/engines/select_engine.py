@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import jax
@@ -111,17 +111,12 @@ class EngineWithFallback:
         self._choose_engine(lambda compiled: compiled.n_operations)
         return Trajectory(self, self._call_with_fallback(lambda engine, _: engine.start(x)))
 
-    def final_state_function(
-        self, segments: Sequence[tuple[float, int]]
-    ) -> Callable[[np.ndarray], np.ndarray | None] | None:
-        """Return a function of initial states: see :meth:`.step_loop.CompiledTrajectory.final_state_function`.
-
-        The result is None if the compiled engine does not run the system.
-        """
+    def compiled_trajectory(self, is_new: bool = False) -> CompiledTrajectory | None:
+        """Return the trajectory of the compiled engine, a new one if ``is_new``; None if another engine runs."""
         self._choose_engine(lambda compiled: compiled.n_operations)
         if not isinstance(self._engine, CompiledEngine):
             return None
-        return self._engine.trajectory.final_state_function(segments)
+        return self._engine.new_trajectory() if is_new else self._engine.trajectory
 
     def advance_trajectory(
         self, trajectory: CompiledTrajectory | EngineTrajectory, h: float, n_saves: int, steps_per_save: int

@@ -308,7 +308,7 @@ def make_newton_lineariser(
     options: SolverOptions = DEFAULT_OPTIONS,
     map_function: Callable | None = None,
 ) -> Callable:
-    """Return a function from k to the solver of Newton's equation at k, a function from the residual to the step.
+    """Return a function of k that linearises the equations at k, and returns the map from a residual to Newton's step.
 
     ``map_function(function, vectors)`` computes the columns of the Jacobian matrix; without it ``vmap`` does, and large
     systems are solved without a matrix.

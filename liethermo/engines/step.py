@@ -226,7 +226,7 @@ def finish_step(
         new_compensation = clock_components(system, new_compensation)
     elif can_correct_energy_drift(system, method):  # by the error of the last step: no step waits for its own energy
         new_compensation = compensation_after_drift_correction(system, new_x, new_compensation, correction)
-        correction = energy_drift_correction(system, new_x, new_compensation, energy, state.first_energy)
+        correction = energy_drift_multiplier(system, new_x, new_compensation, energy, state.first_energy)
     is_taken = solution.converged & jnp.isfinite(end.finite_check)
     failure_code = jnp.where(
         solution.converged | ~solution.is_finite, int(StatusCode.NON_FINITE), int(StatusCode.NOT_CONVERGED)
@@ -295,7 +295,7 @@ def can_correct_energy_drift(system: System, method: OneStepMethod) -> bool:
     return system.energy_law == "conserved" and "energy" in method.preserves
 
 
-def energy_drift_correction(system: System, x, compensation, energy, first_energy) -> jax.Array:
+def energy_drift_multiplier(system: System, x, compensation, energy, first_energy) -> jax.Array:
     """Return the multiple of the energy gradient that is subtracted from a state, by ``eps |x| / 4`` at most.
 
     Each step is exact up to a few roundings, whose sum is a random walk: 1e-13 in 1e6 steps for a general energy. A sum

@@ -3,7 +3,7 @@
 An adaptive run carries an :class:`AdaptiveState`. One attempt takes a step, estimates its error, and chooses the size
 of the next step. The run pauses when the host has to act: at a stop time, if the growth rate must be computed, and at a
 possible event. A step in which the event function changes its sign is repeated with shorter sizes, until it ends at
-the sign change: at a zero, which is an event, or at a jump (:meth:`.lanes.PauseHandler.confirm_events`).
+the sign change: at a zero, which is an event, or at a jump (:meth:`.lanes.PauseHandler.decide_sign_changes`).
 """
 
 from __future__ import annotations
@@ -514,7 +514,7 @@ def step_size_after_rejection(error, h, power) -> jax.Array:
 # -- growth rates -----------------------------------------------------------------------------------------------------
 
 
-def max_step_times_growth_rate(method: OneStepMethod) -> float:
+def max_step_times_growth_rate_for_accuracy(method: OneStepMethod) -> float:
     """Return the largest product of step size and growth rate at which growth is accurate to :data:`GROWTH_RATE_RTOL`.
 
     A step of a one-step method multiplies the solution of a linear equation of rate r by R(h r), instead of exp(h r).
@@ -532,7 +532,7 @@ def limit_next_step_by_growth_rate(method: OneStepMethod, adaptive_state: Adapti
     ``probe`` is the Jacobian probe at the state: see :func:`.growth_rate.jacobian_probe`.
     """
     is_short = ~(
-        (max_step_times_growth_rate(method) < spectral_radius_bound(probe) * adaptive_state.next_step_size)
+        (max_step_times_growth_rate_for_accuracy(method) < spectral_radius_bound(probe) * adaptive_state.next_step_size)
         & jnp.isfinite(spectral_radius_bound(probe))
     )
     is_unchanged = frobenius_norm(probe - adaptive_state.jacobian_probe) <= JACOBIAN_CHANGE_RTOL * frobenius_norm(
@@ -540,7 +540,7 @@ def limit_next_step_by_growth_rate(method: OneStepMethod, adaptive_state: Adapti
     )
     limit = jnp.where(
         adaptive_state.growth_rate > 0.0,
-        max_step_times_growth_rate(method)
+        max_step_times_growth_rate_for_accuracy(method)
         / jnp.where(adaptive_state.growth_rate > 0.0, adaptive_state.growth_rate, 1.0),
         jnp.inf,
     )

@@ -90,7 +90,7 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
         return wrap_in_charts(method, system, self.method.retraction, "midpoint")
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
-        z, dH, dS, dL = self.method.midpoint_gradients(system, x, compensation, h, k)
+        z, dH, dS, dL = self.method.midpoint_and_gradients(system, x, compensation, h, k)
         factors_and_inputs = self._factors_and_inputs(system, z, dH, dL, h)
         slope = system.field(z, dH, dS, dL) + sum(B.times(w) for B, w in factors_and_inputs)
         rotations = [
@@ -105,7 +105,7 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
         return (slope if change is None else k[0] + change)[None]
 
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
-        z, dH, dS, dL = self.method.midpoint_gradients(system, x, compensation, h, k)
+        z, dH, dS, dL = self.method.midpoint_and_gradients(system, x, compensation, h, k)
         factors_and_inputs = self._factors_and_inputs(system, z, dH, dL, h)
         return sum((B.velocity(w) for B, w in factors_and_inputs if B.velocity), start=system.transport(z, dH, dS, dL))[
             None

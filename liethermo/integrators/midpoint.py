@@ -71,9 +71,9 @@ class MetriplecticMidpoint(TransportingMethod):
     preserves = frozenset({"energy", "entropy_law_quadratic", "quadratic_casimirs"})
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
-        return system.field(*self.midpoint_gradients(system, x, compensation, h, k))[None]
+        return system.field(*self.midpoint_and_gradients(system, x, compensation, h, k))[None]
 
-    def midpoint_gradients(self, system: System, x, compensation, h, k) -> tuple:
+    def midpoint_and_gradients(self, system: System, x, compensation, h, k) -> tuple:
         """Return the arguments of the field: the midpoint z, and the gradients dH, dS and dL of the step."""
         d = h * k[0]
         z = x + (compensation + 0.5 * d)
@@ -83,7 +83,7 @@ class MetriplecticMidpoint(TransportingMethod):
         return z, dH, dS, dL
 
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
-        return system.transport(*self.midpoint_gradients(system, x, compensation, h, k))[None]
+        return system.transport(*self.midpoint_and_gradients(system, x, compensation, h, k))[None]
 
     def can_transport_attitude(self, system: System) -> bool:
         return True

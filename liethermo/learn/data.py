@@ -283,13 +283,13 @@ class NoiseLevels(NamedTuple):
 
 def noise_levels(data: list[Trajectory], scale: np.ndarray) -> NoiseLevels:
     """Return the standard deviations of the errors of each component, or upper bounds of them."""
-    levels = np.array([_difference_levels([_column_values(tr, k) for tr in data]) for k in range(len(scale))])
+    levels = np.array([_divided_difference_stds([_column_values(tr, k) for tr in data]) for k in range(len(scale))])
     is_noise = (levels[:, -1] > NOISE_PLATEAU_RATIO * levels[:, -3]) & (levels[:, -1] > MIN_RELATIVE_NOISE * scale)
     std = np.where(is_noise, levels[:, -3:].mean(axis=1), levels.min(axis=1))
     return NoiseLevels(np.maximum(std, MIN_RELATIVE_NOISE * scale), is_noise, np.asarray(levels.any(axis=1)))
 
 
-def _difference_levels(column: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+def _divided_difference_stds(column: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     """Return the standard deviation of normalised divided differences of each order, by their median; zeros if there
     are too few."""
     if sum(max(len(t) - DIFFERENCE_ORDERS[-1], 0) for t, _ in column) < MIN_DIFFERENCES:

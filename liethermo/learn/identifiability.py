@@ -233,7 +233,7 @@ def several(
 
 
 def _noise_std(trajectories: list[Trajectory], noise) -> np.ndarray | None:
-    """Return the standard deviations of the errors of data, given or estimated; None if there are none."""
+    """Return the standard deviations of the measurement errors, given or estimated; None if the data show none."""
     flat_trajectories = [trajectory.flat_trajectory for trajectory in trajectories]
     scale = data_scales(flat_trajectories).scale
     return estimate_noise(flat_trajectories, scale) if noise is None else checked_noise(noise, scale.size)

@@ -239,15 +239,20 @@ def inverse_inertia(inertia) -> jax.Array:
     """
     inertia = host_array(real_array(inertia))
     if inertia.ndim == 1:
-        xp, is_zero = jnp if is_traced(inertia) else np, inertia == 0.0
-        return real_array(xp.where(is_zero, 0.0, 1.0 / xp.where(is_zero, 1.0, inertia)))
+        return real_array(inverse_moments(inertia))
     if not is_traced(inertia):
         moments, axes = np.linalg.eigh(np.asarray(inertia))
         if is_rod(moments):
-            inverse_moments = np.append(0.0, 1.0 / moments[1:])
-            return real_array(axes * inverse_moments @ axes.T)
+            inverse_of_rod = np.append(0.0, 1.0 / moments[1:])
+            return real_array(axes * inverse_of_rod @ axes.T)
     inverse = jnp.linalg.inv(inertia)
     return 0.5 * (inverse + inverse.T)
+
+
+def inverse_moments(moments):
+    """Return the inverse of each moment of inertia, zero for a moment of zero; NumPy computes with its own arrays."""
+    xp, is_zero = np if isinstance(moments, np.ndarray) else jnp, moments == 0.0
+    return xp.where(is_zero, 0.0, 1.0 / xp.where(is_zero, 1.0, moments))
 
 
 def is_symmetric(blocks: np.ndarray) -> bool:

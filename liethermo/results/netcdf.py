@@ -231,9 +231,9 @@ def _check_file_digest(path: Path) -> None:
         raise FileError(f"{path} is damaged, or was changed: it does not have the checksum that it was written with")
 
 
-def _sha256_of_prefix(path: Path, n_remaining: int) -> bytes:
-    """Return the SHA-256 of the first ``n_remaining`` bytes of a file, in hexadecimal digits."""
-    digest = hashlib.sha256()
+def _sha256_of_prefix(path: Path, n_bytes: int) -> bytes:
+    """Return the SHA-256 of the first ``n_bytes`` bytes of a file, in hexadecimal digits."""
+    digest, n_remaining = hashlib.sha256(), n_bytes
     with open(path, "rb") as file:
         while n_remaining > 0:
             chunk = file.read(min(n_remaining, 2**20))

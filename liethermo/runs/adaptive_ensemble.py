@@ -186,7 +186,7 @@ class _BatchRecorder:
             columns = [runs.read("x", indices), *(runs.read(n, indices)[:, None] for n in ("energy", "entropy"))]
             self.record.store_states_at(self.members[indices], runs.read("t", indices), np.hstack(columns))
 
-    def record_ends(self) -> None:
+    def record_ended_trajectories(self) -> None:
         status = self.runs.read("status")
         indices = np.flatnonzero(self.is_running & ~np.isin(status, RUNNING_CODES))
         if indices.size:

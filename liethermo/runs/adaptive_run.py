@@ -173,7 +173,7 @@ class _SingleRecorder:
         if self.events is not None:
             self.events.raise_error()
 
-    def record_ends(self) -> None:
+    def record_ended_trajectories(self) -> None:
         if self._scalar("status") == StatusCode.EVENT:
             self.outcome.event_time = self._scalar("t")
         if self.events is not None:

@@ -58,7 +58,7 @@ class AdaptiveRecorder(Protocol):
     def record_pauses(self) -> None:
         """Record events, and states at times at which steps have to end; the trajectories resume afterwards."""
 
-    def record_ends(self) -> None:
+    def record_ended_trajectories(self) -> None:
         """Record the trajectories that have ended."""
 
 
@@ -67,7 +67,7 @@ def drive_adaptive(pause_handler: PauseHandler, recorder: AdaptiveRecorder) -> N
     pause_handler.resume_paused()
     while recorder.continues():
         recorder.attempt()
-        pause_handler.confirm_events()
+        pause_handler.decide_sign_changes()
         recorder.record_pauses()
         pause_handler.resume_paused()
-        recorder.record_ends()
+        recorder.record_ended_trajectories()

@@ -27,7 +27,7 @@ from ..engines.step import (
     can_correct_energy_drift,
     compensation_after_drift_correction,
     end_of_step,
-    energy_drift_correction,
+    energy_drift_multiplier,
     stage_equations,
 )
 from ..errors import InputError
@@ -375,7 +375,7 @@ def differentiable_step(
             system,
             new_x,
             new_compensation,
-            energy_drift_correction(system, new_x, new_compensation, energy, system.energy.value(x)),
+            energy_drift_multiplier(system, new_x, new_compensation, energy, system.energy.value(x)),
         )
     return new_x, new_compensation, new_k, k
 

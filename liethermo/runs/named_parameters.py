@@ -10,10 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._arrays import host_array, real_array
+
 from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
 from ..errors import InputError
 from ..functions.energy import Quadratic
-from ..models.inertia import inverse_inertia
+from ..models.inertia import inverse_moments
 from ..systems import System
 from ..tracing.caching import memoize
 
@@ -41,11 +43,16 @@ class NamedParameter(NamedTuple):
     is_inverse: bool = False
 
     def to_leaf(self, value):
-        """Return the entry of the arrays for a value of the parameter, or for several along the first axis."""
+        """Return the entry of the arrays for a value of the parameter, or for several along the first axis.
+
+        Parameters
+        ----------
+        value : ndarray or tracer
+        """
         if not self.is_inverse:
             return value
         if np.shape(self.value) == (3,):  # entry by entry, also of several sets of moments
-            return inverse_inertia(jnp.ravel(value)).reshape(np.shape(value))
+            return inverse_moments(value)
         return jnp.linalg.inv(value)
 
 
@@ -71,17 +78,17 @@ def replace_parameters(system: System, values: Mapping[str, Any]) -> System:
     replaced: dict[int, str] = {}
     for name, value in values.items():
         parameter = find_parameter(system, name)
-        array = jnp.asarray(value, dtype=jnp.float64)
+        array = host_array(real_array(value))
         if array.shape != parameter.value.shape:
             raise InputError(f"{name} must have shape {parameter.value.shape}, got {array.shape}")
         _check_given_once(replaced, name, parameter)
         for i in parameter.leaves:
-            leaves[i] = parameter.to_leaf(array)
+            leaves[i] = real_array(parameter.to_leaf(array))
     return ProgramStructure.from_module(system).rebuild(leaves)
 
 
 def arrays_with_members(system: System, values: Mapping[str, Any]) -> list[np.ndarray]:
-    """Return the arrays of a family of systems, members along the first axis, from values of some parameters by name.
+    """Return the arrays of a family of systems, members along the first axis, for given values of some parameters.
 
     Arrays that all members share have a first axis of length 1.
 

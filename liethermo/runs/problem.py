@@ -43,6 +43,8 @@ class Problem:
         Whether functions of the system depend on time.
     state_shape : tuple of int
         Shape of a state: (n,), or (*sites, d).
+    has_fixed_domain : bool
+        Whether runs may start at the same states whatever the parameters of the system are.
     starts_anywhere : bool
         Whether every finite array of shape (n,) is an initial state.
     """
@@ -55,13 +57,16 @@ class Problem:
         self._engines = _ThreadEngines()
         self.state_shape = system.shape if system.sites else (system.dim,)
         kind = type(system)
-        self.starts_anywhere = (
+        self.has_fixed_domain = (
             system.space is None
+            and kind.outside is SystemInterface.outside
+            and kind.why_singular is SystemInterface.why_singular
+        )
+        self.starts_anywhere = (
+            self.has_fixed_domain
             and not self.is_driven
             and kind.state_array is System.state_array
             and not isinstance(system, AttitudeSystem)
-            and kind.outside is SystemInterface.outside
-            and kind.why_singular is SystemInterface.why_singular
         )
 
     @classmethod
@@ -106,7 +111,7 @@ class Problem:
     def engine(
         self, requested_engine: str, system: System, planned_steps: int, noise_increments: Callable | None = None
     ) -> EngineWithFallback:
-        """Return an engine for a run in this thread; runs share it unless it belongs to one span or one path.
+        """Return the engine of a run in this thread: a shared one, or a new one if it serves one span or path.
 
         Parameters
         ----------

@@ -6,7 +6,7 @@ import functools
 import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from ..results.ensemble import Ensemble
 from ..results.solution import Solution
 from ..systems import AttitudeSystem, System
 from ..tracing.caching import LRUCache
+from ..tracing.scalarize import UnsupportedPrimitive
 from .adaptive import Adaptive
 from .ensemble import ensemble
 from .events import Until
@@ -32,10 +33,14 @@ from .progress import Progress
 from .run import Run
 from .schedule import CHUNK_STEPS, ScheduleSegment, StepSchedule, checked_span, checked_step, make_schedule
 from .time_features import schedule_around_features
+from .varied_parameters import VariedParameters
 
 CONVERGENCE_FAILURES = tuple(
     code.status_name for code in (StatusCode.NOT_CONVERGED, StatusCode.STEP_UNDERFLOW, StatusCode.STEP_LIMIT)
 )
+
+FinalStateFunction: TypeAlias = Callable[[Any], np.ndarray | None]
+"""A function from an initial state to the last state; its result is None where a run has to compute that."""
 
 MAX_CACHED_PARAMETER_SETS = 32
 """Sets of parameters whose prepared propagators are held in memory, those last used."""
@@ -185,7 +190,7 @@ class Propagator:
                 run.run_adaptive_or_until_event(bar, step if adaptive else schedule.h, until)
             else:
                 run.run_fixed(bar)
-        solution = run.solution()
+        solution = run.solution_so_far()
         if save_to is not None:
             try:
                 solution.save(save_to)
@@ -213,11 +218,14 @@ class Propagator:
             As :func:`integrate` does.
         """
         if parameters:
-            return self.with_parameters(parameters).final(x0, t_span)
+            x = self._final_state_with_parameters(x0, t_span, parameters)
+            return self.with_parameters(parameters).final(x0, t_span) if x is None else x
         functions = self._thread.final_functions
         function = functions.get(t_span) if type(t_span) is tuple else None
         if function is None:
             function = self._final_state_function(t_span)
+            if type(t_span) is tuple and function is not None:
+                self._thread.add(t_span, function)
         if function is not None and (x := function(x0)) is not None:
             return x
         return self(x0, t_span, save_every=CHUNK_STEPS).x[-1]
@@ -283,7 +291,7 @@ class Propagator:
     def _schedule(
         self, t_span, save_every: int, save_at, allow_infinite_end: bool, breaks, declared: DeclaredTimes
     ) -> StepSchedule:
-        """Return the schedule of a run; short ones that were used last are held in memory."""
+        """Return the schedule of a run; short schedules are cached, and those used last are kept."""
         if save_at is not None or allow_infinite_end or np.size(breaks) or any(declared) or type(save_every) is not int:
             return make_schedule(t_span, self.step, save_every, save_at, allow_infinite_end, breaks, declared)
         key = *checked_span(t_span), save_every
@@ -294,25 +302,32 @@ class Propagator:
                 self._schedules.get_or_compute(key, lambda: schedule)
         return schedule
 
-    def _final_state_function(self, t_span: tuple[float, float]) -> Callable[[Any], np.ndarray | None] | None:
+    def _final_state_function(self, t_span, varied: VariedParameters | None = None) -> FinalStateFunction | None:
         """Return the function from x0 to the last state of runs over a span, which machine code computes.
 
-        It is held in memory for this thread. The result is None where a run has to compute the last state, and that of
-        the function where a run has to say why a step fails.
+        The result is None where a run has to compute the last state, and that of the function where a run has to say
+        why a step fails.
+
+        Parameters
+        ----------
+        t_span : (float, float)
+        varied : VariedParameters, optional
+            The function takes these parameters from it at each call.
         """
         problem = self._problem_of_final
-        if problem is None:
+        if problem is None or (varied is not None and not varied.select_program(problem)):
             return None
         start, end = checked_span(t_span)
         h = checked_step(self.step, start, end)
         segment = ScheduleSegment.from_span(start, end, h)
         if segment.n_full_steps > CHUNK_STEPS:
             return None  # a run in portions, which Ctrl-C can stop
-        compute = problem.engine(self.engine, problem.system, segment.n_steps).final_state_function(
-            segment.equal_steps(h)
+        trajectory = problem.engine(self.engine, problem.system, segment.n_steps).compiled_trajectory(
+            varied is not None
         )
-        if compute is None:
+        if trajectory is None:
             return None
+        compute = trajectory.final_state_function(segment.equal_steps(h))
         state_shape, flat_shape, starts_anywhere = problem.state_shape, (problem.system.dim,), problem.starts_anywhere
 
         def final_state(x0) -> np.ndarray | None:
@@ -320,12 +335,44 @@ class Propagator:
             x = compute(x0 if is_state else np.asarray(problem.initial_state(x0, start)))
             return x if x is None or state_shape == flat_shape else x.reshape(state_shape)
 
-        functions = self._thread.final_functions
-        if type(t_span) is tuple:
-            if len(functions) >= MAX_CACHED_SCHEDULES:
-                functions.clear()
-            functions[t_span] = final_state
-        return final_state
+        if varied is None:
+            return final_state
+
+        def final_state_with_parameters(x0) -> np.ndarray | None:
+            trajectory.parameters[varied.indices] = varied.entries
+            return final_state(x0)
+
+        return final_state_with_parameters
+
+    def _final_state_with_parameters(self, x0, t_span, parameters: Mapping[str, Any]) -> np.ndarray | None:
+        """Return the last state for new values of parameters by machine code that takes them as arguments.
+
+        None where a propagator of its own has to compute it, which tests anew what the system conserves.
+        """
+        names, thread = tuple(parameters), self._thread
+        if names not in thread.varied:
+            self.with_parameters(parameters)  # which checks the names
+            thread.varied[names] = self._varied_parameters(names)
+        varied = thread.varied[names]
+        key = None if varied is None or type(t_span) is not tuple else varied.program_key(parameters.values())
+        if varied is None or key is None:
+            return None
+        function = thread.final_functions.get((names, key, t_span))
+        if function is None:
+            function = self.with_parameters(parameters)._final_state_function(t_span, varied) or _leave_to_run
+            thread.add((names, key, t_span), function)
+        return function(x0)
+
+    @with_library_settings
+    def _varied_parameters(self, names: tuple[str, ...]) -> VariedParameters | None:
+        """Return parameters that are arguments of machine code; None where they may decide which code runs."""
+        problem = self._problem_of_final
+        if problem is None or not problem.has_fixed_domain or self.system.preserved:
+            return None
+        try:
+            return VariedParameters(self.system, self.method, names)
+        except UnsupportedPrimitive:
+            return None
 
     @functools.cached_property
     @with_library_settings
@@ -339,11 +386,29 @@ class Propagator:
         return None if problem.is_driven or isinstance(problem.system, AttitudeSystem) else problem
 
 
+def _leave_to_run(x0) -> None:
+    """Return None: a run has to compute the last state."""
+
+
 class _ThreadFunctions(threading.local):
-    """Functions that compute final states over spans, in the buffers of one thread."""
+    """Functions that compute final states over spans, in the buffers of one thread.
+
+    Attributes
+    ----------
+    final_functions : dict
+        Keys are spans; with varied parameters their names, the key of the program, and the span.
+    varied : dict from names to VariedParameters or None
+        Parameters that were given to calls; None for those that machine code does not take as arguments.
+    """
 
     def __init__(self):
-        self.final_functions: dict[tuple[float, float], Callable[[Any], np.ndarray | None]] = {}
+        self.final_functions: dict[tuple, FinalStateFunction] = {}
+        self.varied: dict[tuple[str, ...], VariedParameters | None] = {}
+
+    def add(self, key: tuple, function: FinalStateFunction) -> None:
+        if len(self.final_functions) >= MAX_CACHED_SCHEDULES:
+            self.final_functions.clear()
+        self.final_functions[key] = function
 
 
 def raise_failure(solution: Solution) -> None:

@@ -263,7 +263,7 @@ class Run:
 
     # -- the result ---------------------------------------------------------------------------------------------------
 
-    def solution(self) -> Solution:
+    def solution_so_far(self) -> Solution:
         """Return the solution of the run so far."""
         x = np.concatenate(self.saved_states)
         energy, entropy = np.concatenate(self.saved_energies_entropies).T
@@ -293,11 +293,11 @@ class Run:
         return DenseOutput(np.concatenate(times), np.concatenate(states), self.engine.step_ends)
 
     def _checkpoint(self, read_state: Callable[[], State]) -> None:
-        """Write the run so far to the file ``save_to``, if the last time was long ago."""
+        """Write the run so far to the file ``save_to``, if enough time has passed since the last write."""
         if self.save_to is not None and time.perf_counter() - self.last_checkpoint_time > CHECKPOINT_SECONDS:
             self.stats = run_statistics(read_state(), self._wall_time())
             try:
-                self.solution().save(self.save_to)
+                self.solution_so_far().save(self.save_to)
             except FileError as error:  # the disk may have space again at the end
                 warn(f"{error}. The run goes on")
             self.last_checkpoint_time = time.perf_counter()

@@ -87,7 +87,7 @@ def adaptive_failure_status(
     (start, end), steps, residual = span, int(outcome.state.step), float(outcome.state.residual)
     x = np.asarray(outcome.state.x)
     if outcome.exhausted_limit != "memory" and (
-        text := blow_up_message(x, x0, vector_field_at(system, x[None])[0], t - start, t)
+        text := blow_up_message_or_empty(x, x0, vector_field_at(system, x[None])[0], t - start, t)
     ):
         code = StatusCode.STEP_LIMIT if outcome.exhausted_limit else StatusCode.STEP_UNDERFLOW
         return Status(code, f"after {steps} steps {text}", steps, t, residual)
@@ -147,7 +147,7 @@ def event_remarks(outcome, names: Sequence[str], terminal_counts: Sequence[int |
     return text
 
 
-def blow_up_message(x: np.ndarray, x0: np.ndarray, velocity: np.ndarray, time_elapsed: float, t: float) -> str:
+def blow_up_message_or_empty(x: np.ndarray, x0: np.ndarray, velocity: np.ndarray, time_elapsed: float, t: float) -> str:
     """Return a message if the state grows without bound, with its norm and the time; otherwise ""."""
     norm = np.abs(x).max()
     if norm > BLOW_UP_SIZE or (
@@ -200,7 +200,7 @@ def ensemble_failure_message(
 
     No shorter steps are tried. The step size h is NaN for adaptive steps.
     """
-    if text := blow_up_message(x, x0, velocity, time_elapsed if np.isnan(h) else 0.0, t):
+    if text := blow_up_message_or_empty(x, x0, velocity, time_elapsed if np.isnan(h) else 0.0, t):
         return text
     initial_norm, norm = np.abs(x0).max(), np.abs(x).max()
     if _does_norm_double_within(x, velocity, BLOW_UP_HORIZON_STEPS * h) and norm > MIN_GROWTH_TO_REPORT * initial_norm:
@@ -231,7 +231,9 @@ def final_status(engine: EngineWithFallback, state, t: float, h: float, interrup
         return Status(StatusCode.COMPLETED, f"reached t = {t:g} in {step} steps", step, t, residual)
     step_text = f"step {step + 1}, from t = {t:g} with h = {h:g}"
     x = np.asarray(state.x)
-    if text := blow_up_message(x, x, np.zeros_like(x), 0.0, t) or _blow_up_text_from_shorter_steps(engine, state, t, h):
+    if text := blow_up_message_or_empty(x, x, np.zeros_like(x), 0.0, t) or _blow_up_text_from_shorter_steps(
+        engine, state, t, h
+    ):
         return Status(StatusCode(code), f"{step_text}, could not be taken: {text}", step, t, residual)
     if code == StatusCode.NOT_CONVERGED and engine.method.explicit:
         message = (

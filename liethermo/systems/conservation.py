@@ -98,17 +98,24 @@ class PointwiseVerdicts(NamedTuple):
         dissipation much slower than the motion counts too.
     """
 
-    is_defined: np.ndarray
-    is_conserved: np.ndarray
+    is_defined: np.ndarray | jax.Array
+    is_conserved: np.ndarray | jax.Array
 
 
-def judge_conservation(rates: InvariantRates) -> PointwiseVerdicts:
-    """Return at which points each function is conserved."""
+def judge_conservation(rates: InvariantRates, tolerance: float = AXIOM_TOLERANCE) -> PointwiseVerdicts:
+    """Return at which points each function is conserved, for rates of NumPy or of JAX.
+
+    Parameters
+    ----------
+    rates : InvariantRates
+    tolerance : float
+        Largest rate of a conserved function, relative to its scale.
+    """
     values, scales = rates
     with np.errstate(invalid="ignore"):
-        each_vanishes = (np.abs(values) <= AXIOM_TOLERANCE * scales).all(axis=-2)
-        sum_vanishes = np.abs(values.sum(axis=-2)) <= AXIOM_TOLERANCE * np.abs(values).max(axis=-2)
-    return PointwiseVerdicts(np.asarray(np.isfinite(values).all(axis=-2)), each_vanishes | sum_vanishes)
+        each_vanishes = (abs(values) <= tolerance * scales).all(axis=-2)
+        sum_vanishes = abs(values.sum(axis=-2)) <= tolerance * abs(values).max(axis=-2)
+    return PointwiseVerdicts((abs(values) < np.inf).all(axis=-2), each_vanishes | sum_vanishes)
 
 
 def is_proportional(f: np.ndarray, g: np.ndarray) -> np.ndarray:

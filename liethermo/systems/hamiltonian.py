@@ -113,7 +113,7 @@ def _energy_of_terms(terms: Sequence, times) -> tuple[int, Energy]:
 
 
 def _coefficient_function(coefficient, times, i: int) -> Callable:
-    """Return the function of time of a coefficient that is an array of its values at ``times``."""
+    """Return a function of time that interpolates the values of a coefficient at ``times``."""
     if isinstance(coefficient, str):
         raise InputError(
             f"the coefficient of term {i} of the Hamiltonian is the string {coefficient!r}, which is not evaluated. "

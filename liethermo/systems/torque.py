@@ -102,7 +102,7 @@ def check_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | Non
     terms = _torque_terms(given)
     if not terms:
         raise InputError("torque is an empty list: a system without a torque is given None")
-    counts = tuple(map(_argument_count, terms))
+    counts = tuple(map(_checked_argument_count, terms))
     if max(counts) > MIN_ARGUMENTS and group is None:
         name = torque_name(next(term for term, n in zip(terms, counts, strict=True) if n > MIN_ARGUMENTS))
         raise InputError(f"the torque {name} depends on the attitude: give the system a group, such as group=mf.SO(3)")
@@ -201,7 +201,7 @@ MAX_ARGUMENTS = 4
 """Largest number of arguments of a torque: after t and mu the attitude, then the velocity ``dH/dmu``."""
 
 
-def _argument_count(term: Any) -> int:
+def _checked_argument_count(term: Any) -> int:
     if not callable(term):
         raise InputError(
             "a torque is a function of t and mu, or of t, mu and the attitude, such as "

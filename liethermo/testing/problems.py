@@ -83,7 +83,7 @@ def closed_system_problems() -> dict[str, Problem]:
 
 
 def density_matrix_problems() -> dict[str, Problem]:
-    """Return open quantum systems: three levels with two jumps, and a driven qubit from its ground state."""
+    """Return two open quantum systems: one of three levels with two jumps, and a driven qubit in its ground state."""
     lower, sx = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0, 1.0], [1.0, 0.0]])
     H = np.array([[0.0, 0.3, 0.1j], [0.3, 0.8, 0.2], [-0.1j, 0.2, 1.5]])
     levels = QuantumSystem(H, LindbladJumps([(np.eye(3, k=1), 0.4), (np.diag([0.0, 1.0, -1.0]), 0.2)]))

@@ -557,7 +557,7 @@ def check_saved_run(case: RelationCase) -> SkipReason:
     return None
 
 
-def check_scipy(case: RelationCase) -> SkipReason:
+def check_solve_ivp_matches_integrate(case: RelationCase) -> SkipReason:
     """Check that ``solve_ivp`` takes the steps of ``integrate``, and finds the event that ``until`` finds."""
     if case.system.sites or case.system.space is not None:
         return "SciPy's states are vectors"
@@ -646,7 +646,7 @@ RELATIONS: dict[str, Callable[[RelationCase], SkipReason]] = {
     "company": check_family_members,
     "study": check_study,
     "file": check_saved_run,
-    "scipy": check_scipy,
+    "scipy": check_solve_ivp_matches_integrate,
     "diffrax": check_diffrax,
 }
 """The check of each relation, by name."""

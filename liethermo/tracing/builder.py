@@ -64,7 +64,7 @@ class Instruction(NamedTuple):
     args: tuple[Scalar, ...]
 
 
-def _truncate_to_int64(a) -> np.ndarray:
+def _saturating_int64(a) -> np.ndarray:
     """Convert numbers to integers as XLA does: NaN becomes 0, and a number out of range the nearest integer."""
     a = np.asarray(a, dtype=np.float64)
     is_in_range = np.abs(a) < 2.0**63
@@ -138,7 +138,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = (
         "select": np.where,
         "float": lambda a: np.asarray(a, dtype=np.float64),
         "int": lambda a: np.asarray(a, dtype=np.int64),
-        "truncate": _truncate_to_int64,
+        "truncate": _saturating_int64,
         "branch": lambda condition, number: condition,
         "quotient": _integer_quotient,
         "wrap": _wrap_integer,

@@ -32,7 +32,7 @@ class ConstantLifter:
     def __init__(self):
         self.has_while_loop = False
 
-    def lift_jaxpr(self, closed_jaxpr: ClosedJaxpr) -> tuple[Jaxpr, list, tuple]:
+    def lift_numbers(self, closed_jaxpr: ClosedJaxpr) -> tuple[Jaxpr, list, tuple]:
         """Return the jaxpr, its remaining constants, and its numbers: all scalars in one array, then the arrays."""
         body = _LiftedBody(self)
         body.append_and_set_outputs(closed_jaxpr.jaxpr, closed_jaxpr.consts, closed_jaxpr.jaxpr.invars)

@@ -156,7 +156,7 @@ def _strip_weak_type(array):
 
 
 def _split_arguments(function: Callable, arguments: tuple) -> tuple[_ArrayFunction, tuple, tuple]:
-    """Return a function of the arrays among the arguments, these arrays, and a key of all the rest."""
+    """Split arguments into a function of their arrays alone, these arrays, and a hashable key of all the rest."""
     leaves, structure = jax.tree_util.tree_flatten(arguments)
     dynamic = tuple(_strip_weak_type(leaf) if eqx.is_array(leaf) else None for leaf in leaves)
     static = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)

@@ -250,7 +250,7 @@ WRAPPING_PRIMITIVES = frozenset(
 # -- primitives that contain jaxprs -----------------------------------------------------------------------------------
 
 
-def _call(b, eqn, *arguments):
+def _unroll_call_equation(b, eqn, *arguments):
     """Unroll a call; calls of one jaxpr with equal arguments are unrolled once."""
     inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
     jaxpr = inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner
@@ -315,7 +315,7 @@ def _traced_jaxpr(function, static_argument, *avals) -> ClosedJaxpr:
     return jax.make_jaxpr(functools.partial(function, static_argument))(*avals)
 
 
-def _linear_solve(b, eqn, *arguments):
+def _unroll_linear_solve(b, eqn, *arguments):
     """Unroll the user's ``solve`` of ``custom_linear_solve``; its other jaxprs serve derivatives, already taken."""
     lengths, solve = eqn.params["const_lengths"], eqn.params["jaxprs"].solve
     solve_start = lengths.matvec + lengths.vecmat
@@ -327,11 +327,11 @@ def _linear_solve(b, eqn, *arguments):
     )
 
 
-def _cond(b, eqn, index, *arguments):
+def _unroll_cond(b, eqn, branch_index, *arguments):
     """Unroll every branch, which are pure functions, then select the results."""
     avals = [var.aval for var in eqn.outvars]
     branches = eqn.params["branches"]
-    branch_index = index.item()
+    branch_index = branch_index.item()
     if type(branch_index) is not str:
         branches = (branches[min(max(branch_index, 0), len(branches) - 1)],)
     *other_results, result = (_unroll_jaxpr(b, branch.jaxpr, branch.consts, arguments) for branch in branches)
@@ -404,7 +404,7 @@ class _LoopCarry:
         return unflatten_scalars(iter(entries), self.avals)
 
 
-def _while_loop(b, eqn, *arguments):
+def _unroll_while_loop(b, eqn, *arguments):
     """Build the block of a loop of unknown length."""
     params, avals = eqn.params, [var.aval for var in eqn.invars]
     n_test_constants, carry_start = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
@@ -463,7 +463,7 @@ loop does.
 """
 
 
-def _scan(b, eqn, *arguments):
+def _unroll_scan(b, eqn, *arguments):
     """Unroll a loop of known length, or build its block if it is long."""
     params = eqn.params
     inner, n_consts, carry_end = params["jaxpr"], params["num_consts"], params["num_consts"] + params["num_carry"]
@@ -547,7 +547,7 @@ def _scan_as_loop_if_long(b, eqn, constants, carry_start, row_tables) -> list[np
     return carry.final_arrays(loop_results[: len(variable_indices)]) + stacked_outputs
 
 
-def _scatter(b, eqn, x, indices, updates):
+def _unroll_scatter(b, eqn, x, indices, updates):
     """Unroll ``scatter``, which replaces entries by updates or by a function of the entries (``x.at[i].apply``)."""
     entry_builder = ComplexBuilder(b) if eqn.invars[0].aval.dtype.kind == "c" else b
     jaxpr, consts = eqn.params["update_jaxpr"], eqn.params["update_consts"]
@@ -562,13 +562,13 @@ def _scatter(b, eqn, x, indices, updates):
 
 CALL_PRIMITIVES = "jit pjit call closed_call core_call custom_jvp_call custom_vjp_call checkpoint remat remat2"
 CONTROL_FLOW_RULES = {
-    **dict.fromkeys(CALL_PRIMITIVES.split(), _call),
-    "custom_linear_solve": _linear_solve,
+    **dict.fromkeys(CALL_PRIMITIVES.split(), _unroll_call_equation),
+    "custom_linear_solve": _unroll_linear_solve,
     chains.chain_p.name: _divided_difference_chain,
-    "cond": _cond,
-    "scan": _scan,
-    "scatter": _scatter,
-    "while": _while_loop,
+    "cond": _unroll_cond,
+    "scan": _unroll_scan,
+    "scatter": _unroll_scatter,
+    "while": _unroll_while_loop,
 }
 
 

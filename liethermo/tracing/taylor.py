@@ -229,7 +229,7 @@ class _Recurrences:
 
 
 def _start_only_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """Return terms that have a start but no rule, which suffices for tests; other uses raise TaylorSeriesError."""
+    """Return terms with an initial value but no recurrence; uses other than a test raise TaylorSeriesError."""
     return [
         recurrences.add_term(start, None, refusal=(eqn.primitive.name, user_source_line(eqn)))
         for start in _evaluate_equation(eqn, map(recurrences.initial_value, values))

@@ -187,7 +187,7 @@ def trace_function(function: Callable, *arguments) -> TracedFunction:
         check_precision(closed_jaxpr.jaxpr, name)
     check_indices(closed_jaxpr)
     lifter = ConstantLifter()
-    jaxpr, constants, numbers = lifter.lift_jaxpr(closed_jaxpr)
+    jaxpr, constants, numbers = lifter.lift_numbers(closed_jaxpr)
     structure = jax.tree_util.tree_structure(result_shapes)
     avals = tuple(jax.ShapeDtypeStruct(np.shape(a), a.dtype) for a in arguments)
     key = (content_key(ClosedJaxpr(jaxpr, constants)), structure, tuple((a.shape, a.dtype) for a in avals))
@@ -272,7 +272,9 @@ def _trace_with_recorders(
         [scalar for _ in number_indices], *arguments
     )
     check_indices(closed_jaxpr)
-    traced_leaves = [recorders[id(leaf)].result if id(leaf) in recorders else leaf for leaf in leaves]
+    traced_leaves = [
+        recorders[id(leaf)].traced_or_original_function if id(leaf) in recorders else leaf for leaf in leaves
+    ]
     with jax.ensure_compile_time_eval():
         for i in number_indices:
             traced_leaves[i] = jnp.asarray(np.float64(leaves[i]))
@@ -307,7 +309,7 @@ class _CallRecorder:
         self._is_called_otherwise = False
 
     @property
-    def result(self) -> Callable:
+    def traced_or_original_function(self) -> Callable:
         """The traced function; the function itself if it was never called, or was called in more than one way."""
         return (
             next(iter(self._traced_functions.values()))

@@ -112,7 +112,11 @@ class CompiledEngine:
 
     @functools.cached_property
     def trajectory(self) -> CompiledTrajectory:
-        """The only trajectory of this engine, in buffers that every run uses again."""
+        """The trajectory of the runs of this engine, in buffers that every run uses again."""
+        return self.new_trajectory()
+
+    def new_trajectory(self) -> CompiledTrajectory:
+        """Return a trajectory in buffers of its own."""
         return CompiledTrajectory(self._step_loop, self._parameters)
 
     def start(self, x) -> CompiledTrajectory:
@@ -161,17 +165,22 @@ class CompiledTrajectory:
         A loop of one lane, with steps of given sizes.
     parameters : array, shape (p,)
         Parameters of the system and the method, one after another.
+
+    Attributes
+    ----------
+    parameters : array, shape (p,)
+        A copy, which may change in place before a start; which parameters are zero may not.
     """
 
     def __init__(self, step_loop: CompiledStepLoop, parameters: np.ndarray):
-        self._loop, self._parameters = step_loop, np.ascontiguousarray(parameters, dtype=np.float64)
+        self._loop, self.parameters = step_loop, np.array(parameters, dtype=np.float64)
         self._block = step_loop.make_blocks({"x": np.zeros((1, *step_loop.field_shape("x")))})
         self._row = rows = step_loop.block_rows(self._block)[0, :, 0]
         self._x, self._status, self._step, self._h = (
             rows[step_loop.row_slice(name)] for name in ("x", "status", "step", "h")
         )
         self._n_saved_values, self._n_done = step_loop.n_saved_values, np.zeros(1, dtype=np.int64)
-        self._addresses = [array.ctypes.data for array in (self._parameters, self._block, self._n_done)]
+        self._addresses = [array.ctypes.data for array in (self.parameters, self._block, self._n_done)]
 
     def start(self, x, planned_steps: int = 0) -> None:
         """Start a trajectory at x, shape (n,); ``planned_steps`` decides on optimisation."""

@@ -43,7 +43,7 @@ class JacobianCompression:
 
     def __init__(self, pattern: scipy.sparse.csr_array, stages: int = 1):
         self.dim, self.stages = pattern.shape[0], stages
-        self.front_width = _max_level_width(pattern)
+        self.front_width = _max_bfs_level_width(pattern)
         row_sizes = np.diff(pattern.indptr)
         self.dense_rows = np.flatnonzero(row_sizes > _max_coloured_row_size(row_sizes))
         self._dense_row_columns = [pattern.indices[pattern.indptr[i] : pattern.indptr[i + 1]] for i in self.dense_rows]
@@ -150,7 +150,7 @@ def _max_coloured_row_size(row_sizes: np.ndarray) -> int:
     return int(candidates[np.argmin(candidates + n_larger)])
 
 
-def _max_level_width(pattern: scipy.sparse.csr_array) -> int:
+def _max_bfs_level_width(pattern: scipy.sparse.csr_array) -> int:
     """Return the number of nodes in the widest level of a breadth-first search through the largest component.
 
     The search starts at a peripheral node.

@@ -89,7 +89,7 @@ def _closed_form(offsets: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 
 def _diagonal_function(x, y, z):
-    """Return f(x, y, z) of the closed form, even in each argument [Newell, Williams & Dunlop 1993, eq. 27]."""
+    """Return Newell's function f(x, y, z), even in each argument [Newell, Williams & Dunlop 1993, eq. 27]."""
     x, y, z = np.abs(x), np.abs(y), np.abs(z)
     r = np.sqrt(x * x + y * y + z * z)
     return (

@@ -168,7 +168,7 @@ def _cumulant_slope(square, energy, temperature: float) -> float:
 
 
 def _jackknife_variance(quantity: Callable, series: np.ndarray) -> float:
-    """Return the jackknife variance of a function of the rows of a series, in blocks of its autocorrelation times."""
+    """Return the jackknife variance of a function of a series, in blocks of several autocorrelation times."""
     rows = np.arange(len(series))
     count = int(np.clip(len(rows) / (BLOCK_LENGTH * autocorrelation_time(series)), MIN_BLOCKS, MAX_BLOCKS))
     estimates = [quantity(np.delete(rows, block)) for block in np.array_split(rows, count)]

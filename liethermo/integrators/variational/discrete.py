@@ -269,7 +269,7 @@ class DiscreteSystem(Module):
         tangential_part = self.system.tangential_part
         return tangential_part(q0, -dL_dq0 - force_minus), tangential_part(q1, dL_dq1 + force_plus)
 
-    def regularity_matrix(self, q0, q1, S0, S1) -> jax.Array:
+    def momentum_and_constraint_jacobian(self, q0, q1, S0, S1) -> jax.Array:
         """Return the matrix (3.13), shape (n + 1, n + 1): if it is invertible, q_1 and S_1 determine the step."""
 
         def momentum_and_constraint(q1, S1):
@@ -280,7 +280,7 @@ class DiscreteSystem(Module):
 
     def reduced_matrix(self, q0, q1, S0, S1) -> jax.Array:
         """Return the matrix (3.15), shape (n, n): (3.13) is invertible if (3.15) is, and ``D_4 P_d`` is not zero."""
-        matrix = self.regularity_matrix(q0, q1, S0, S1)
+        matrix = self.momentum_and_constraint_jacobian(q0, q1, S0, S1)
         return matrix[:-1, :-1] - jnp.outer(matrix[:-1, -1], matrix[-1, :-1]) / matrix[-1, -1]
 
     def end_entropy_on_constraint(self, q0, q1, S0, steps: int = 12) -> jax.Array:

@@ -115,7 +115,7 @@ class VariationalIntegrator(OneStepMethod):
 
     @classmethod
     def midpoint(cls, alpha: float = 0.5, retraction: str | mf.Retraction | None = None) -> VariationalIntegrator:
-        """Return scheme 2, evaluated between both ends at the fraction alpha: order 2 for alpha = 1/2, else 1.
+        """Return scheme 2, evaluated at a fraction alpha of the step: of order 2 for alpha = 1/2, else of order 1.
 
         ``retraction`` has the curves on a manifold.
         """
@@ -393,7 +393,7 @@ def _step_energies(method: VariationalIntegrator, system: SimpleClosedSystem, h,
 
 @jit_cached
 def _regularity_matrix(discrete: DiscreteSystem, q0, q1, S0, S1):
-    return discrete.regularity_matrix(q0, q1, S0, S1)
+    return discrete.momentum_and_constraint_jacobian(q0, q1, S0, S1)
 
 
 register(VariationalIntegrator.verlet(), VariationalIntegrator.midpoint(), VariationalIntegrator.symmetrised())

@@ -253,7 +253,9 @@ class ComposedSystem(System):
         )
         if bodies:
             terms.append(
-                ContactFriction(bodies, law=nondecreasing_if(self._is_entropy_producing(energy, structure, bodies)))
+                ContactFriction(
+                    bodies, law=nondecreasing_if(self._friction_surely_produces_entropy(energy, structure, bodies))
+                )
             )
         rates = [_diagonal_friction(body) for body in self.subsystems]
         if any(R is not None for R in rates):  # one dissipation for all diagonal frictions
@@ -276,7 +278,9 @@ class ComposedSystem(System):
             terms.append(Drag(graph))
         return sum(terms[1:], terms[0]) if terms else None
 
-    def _is_entropy_producing(self, energy: Energy, structure: mf.ExtendedPhaseSpace, bodies: tuple[int, ...]) -> bool:
+    def _friction_surely_produces_entropy(
+        self, energy: Energy, structure: mf.ExtendedPhaseSpace, bodies: tuple[int, ...]
+    ) -> bool:
         """Return whether contact friction in some bodies is known to produce entropy: see :func:`is_mechanical`."""
         if is_traced(energy):
             return False

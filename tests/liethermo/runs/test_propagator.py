@@ -228,7 +228,7 @@ def test_a_run_that_fell_back_is_told_each_time():
 
 
 def test_what_is_conserved_is_found_once_for_each_set_of_parameters(monkeypatch):
-    """Systems with new parameters hold arrays that cannot change, so that what was found for one is kept."""
+    """The verdicts on one system with new parameters are kept, and serve all that need the same program."""
     p = lt.Propagator(lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2), lt.MetriplecticRungeKutta(4), step=0.5)
     tested = []
     find_verdicts = invariants._conservation_verdicts
@@ -237,4 +237,7 @@ def test_what_is_conserved_is_found_once_for_each_set_of_parameters(monkeypatch)
     )
     for rate in (0.11, 0.12, 0.13):
         p.final([0.1, 0.2, 1.0], (0.0, 2.0), parameters={"dissipation.rate": rate})
+    assert len(tested) == 1
+    for rate in (0.11, 0.12, 0.13):
+        p([0.1, 0.2, 1.0], (0.0, 2.0), parameters={"dissipation.rate": rate})
     assert len(tested) == 3
