@@ -13,7 +13,7 @@ import itertools
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -73,22 +73,10 @@ def compile_step_loop(
         See :class:`.machine_code.MachineCode`.
     """
     module = ir.Module("steps")
-    argument_types = [
-        FLOAT64_POINTER,
-        FLOAT64_POINTER,
-        INT64_POINTER,
-        INT64,
-        INT64,
-        INT64,
-        FLOAT64_POINTER,
-        INT64,
-        FLOAT64_POINTER,
-        BYTE_POINTER,
-    ]
-    function = ir.Function(module, ir.FunctionType(INT64, argument_types), "advance")
+    function = ir.Function(module, ADVANCE_TYPE, "advance")
     function.args[0].add_attribute("noalias")
     _StepLoopWriter(function, programs, layout, state_names, is_per_trajectory, lanes, saved_names).write_loops()
-    begin = ir.Function(module, ir.FunctionType(ir.VoidType(), [FLOAT64_POINTER, FLOAT64_POINTER, INT64]), "begin")
+    begin = ir.Function(module, BEGIN_TYPE, "begin")
     _StepLoopWriter(begin, programs, layout, state_names, is_per_trajectory, lanes, saved_names).write_start_function()
     return MachineCode(module, skip_optimisation)
 
@@ -109,10 +97,10 @@ class CompiledLoops:
         self._steps_so_far = 0
         self._lock = threading.Lock()
         self._loaded: list[
-            tuple[MachineCode, Callable, Callable]
+            tuple[MachineCode, Any, Any]
         ] = []  # kept loaded, because a thread may be running any of them
 
-    def loop_functions(self, n_steps: int, planned_steps: int = 0) -> Sequence[Callable]:
+    def loop_functions(self, n_steps: int, planned_steps: int = 0) -> tuple[Any, Any]:
         """Return ``begin`` and ``advance``, compiled for ``n_steps`` more steps now and ``planned_steps`` later."""
         if self._loaded and not self._loaded[-1][0].skip_optimisation:
             return self._loaded[-1][1:]
@@ -142,6 +130,13 @@ MAX_UNOPTIMISED_OPERATIONS = 30_000
 ADVANCE_SIGNATURE = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * 3, *[ctypes.c_int64] * 3, ctypes.c_void_p,
                            ctypes.c_int64, *[ctypes.c_void_p] * 2)  # fmt: skip
 """C signature of ``advance``: see :class:`_StepLoopWriter`."""
+
+ADVANCE_TYPE = ir.FunctionType(INT64, [FLOAT64_POINTER, FLOAT64_POINTER, INT64_POINTER, INT64, INT64, INT64,
+                               FLOAT64_POINTER, INT64, FLOAT64_POINTER, BYTE_POINTER])  # fmt: skip
+"""Type of ``advance`` for LLVM."""
+
+BEGIN_TYPE = ir.FunctionType(ir.VoidType(), [FLOAT64_POINTER, FLOAT64_POINTER, INT64])
+"""Type of ``begin`` for LLVM."""
 
 BEGIN_SIGNATURE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)
 """C signature of ``begin(p, blocks, count)``."""

@@ -50,6 +50,7 @@ from .loop_codegen import (
 from .machine_code import MachineCode
 from .newton_codegen import compile_newton_solver
 from .parameters import ProgramStructure, flat_parameters
+from .short_run import ShortRun
 
 STATE_FIELDS = State._fields
 """Fields of a state."""
@@ -220,24 +221,16 @@ class CompiledTrajectory:
         saved, segments = np.empty(self._n_saved_values), tuple(segments)
         n_total, loop = sum(n_steps for _, n_steps in segments), self._loop
         increments = [loop.noise_by_block(None, 1, n_steps) for _, n_steps in segments]
-        calls = [(h, n, noise.ctypes.data) for (h, n), noise in zip(segments, increments, strict=True)]
-        (parameters, block, n_done), saved_address = self._addresses, saved.ctypes.data
-        x_row, status, h_row, steps_done = self._x, self._status, self._h, self._n_done
+        addresses = dict(zip(("parameters", "block", "n_done"), self._addresses, strict=True))
+        fields = {"status": self._status, "h": self._h, "saved": saved}
+        addresses |= {name: field.ctypes.data for name, field in fields.items()}
+        take_steps, x_row = ShortRun(addresses, segments, increments), self._x
 
         def final_state(x: np.ndarray) -> np.ndarray | None:
-            begin, advance = loop.loop_functions(n_total)
-            status[0], x_row[:] = 0.0, x
-            begin(parameters, block, 1)
-            for h, n_steps, noise in calls:
-                h_row[0], steps_done[0] = h, 0
-                newton = loop.newton_address(False)
-                if advance(parameters, block, n_done, 1, 1, n_steps, saved_address, n_steps, noise, newton) < 1:
-                    return None
-                if status[0]:
-                    return None
-            return x_row.copy()
+            x_row[:] = x
+            return x_row.copy() if take_steps(loop.loop_functions(n_total), loop.newton_address(False)) else None
 
-        final_state.buffers = saved, increments  # type: ignore[attr-defined]  # whose addresses it has
+        final_state.buffer = saved  # type: ignore[attr-defined]  # whose address the run has
         return final_state
 
     def read(self, name: str) -> float:
@@ -582,7 +575,7 @@ class CompiledStepLoop:
 
     # -- machine code -------------------------------------------------------------------------------------------------
 
-    def loop_functions(self, n_steps: int, planned_steps: int = 0) -> Sequence[Callable]:
+    def loop_functions(self, n_steps: int, planned_steps: int = 0) -> tuple[Any, Any]:
         """Return the functions ``begin`` and ``advance`` of the loop, optimised if many steps are taken in all."""
         return self._loops.loop_functions(n_steps, planned_steps)
 
