@@ -16,7 +16,6 @@ import pytest
 import scipy.special
 from jax import lax
 from jax.ad_checkpoint import checkpoint_name
-from jax.extend.core import jaxprs_in_params
 
 import liethermo as lt
 import manifolds as mf
@@ -25,6 +24,7 @@ from liethermo.tracing.builder import Instruction
 from liethermo.tracing.primitives import UNROLLING_RULES
 from liethermo.tracing.program import ScanLoop
 from liethermo.tracing.scalarize import CONTROL_FLOW_RULES, UnsupportedPrimitive, scalarize
+from liethermo.tracing.searches import iterate_equations
 from manifolds.matrices.exponential import expm
 from manifolds.matrices.linear import solve
 from tests.cases import DISSIPATIONS, EPS, build, state_of
@@ -496,10 +496,7 @@ UNTRACED_PRIMITIVES = {
 
 
 def primitives_in(jaxpr) -> set[str]:
-    names = set()
-    for eqn in jaxpr.eqns:
-        names |= {eqn.primitive.name}.union(*map(primitives_in, jaxprs_in_params(eqn.params)))
-    return names
+    return {eqn.primitive.name for eqn, _ in iterate_equations(jaxpr)}
 
 
 @pytest.mark.sampled(27)
