@@ -102,7 +102,8 @@ def body_with_wheels(
     bearing = _BearingFriction(checked_positive(friction, "friction"))
     if attitude:
         whole = jnp.diag(wheel) + (body if body.ndim == 2 else jnp.diag(body))
-        return reaction_wheels(whole, jnp.eye(3), wheel, bearing.friction, heat, temperature, torque=torque)
+        arrays: dict[str, Any] = {"inertia": whole, "axes": jnp.eye(3), "wheels": wheel}
+        return reaction_wheels(**arrays, friction=friction, capacity=heat, temperature=temperature, torque=torque)
     algebra = mf.direct_sum(mf.so(3), mf.abelian(3))
     external = None
     if torque is not None:
