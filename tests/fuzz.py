@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import jaxprs_in_params
 
 from liethermo.tracing.scalarize import CompilerFault, UnsupportedPrimitive, scalarize
+from liethermo.tracing.searches import iterate_equations
 from tests.fuzz_operations import DTYPES, INTEGER_DTYPES, OPERATIONS, limit_size
 from tests.machine_code import compile_program
 from tests.scalar_programs import check_outputs
@@ -152,10 +152,7 @@ def drawn_primitives() -> set[str]:
     names: set[str] = set()
 
     def collect(jaxpr) -> None:
-        for eqn in jaxpr.eqns:
-            names.add(eqn.primitive.name)
-            for inner in jaxprs_in_params(eqn.params):
-                collect(inner)
+        names.update(eqn.primitive.name for eqn, _ in iterate_equations(jaxpr))
 
     for kinds, function in OPERATIONS.values():
         arrays = [jax.ShapeDtypeStruct((3,), jnp.int16 if kind == "i" else DTYPES[kind]) for kind in kinds]

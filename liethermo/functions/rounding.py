@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from ..tracing.routines import has_matrix_products
+from ..tracing.searches import has_matrix_products
 
 EXACT_PRIMITIVES = frozenset(
     """abs broadcast_in_dim ceil clamp concatenate convert_element_type copy copy_p copysign dynamic_slice

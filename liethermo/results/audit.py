@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -212,32 +213,159 @@ class Audit(Tabular):
         return self.rows, ("law", "measured", "allowed"), self.verdict
 
 
+class RunExtremes(NamedTuple):
+    """Extremes over all steps of a single run, as arrays of an ensemble of one: see :class:`liethermo.Ensemble`.
+
+    ``entropy_change`` is the largest change among the saved states; of an entropy that must not fall, its largest fall.
+    """
+
+    steps: np.ndarray
+    ok: np.ndarray
+    residual: np.ndarray
+    first_energy: np.ndarray
+    energy_drift: np.ndarray
+    energy_sensitivity: np.ndarray
+    largest_energy_increment: np.ndarray
+    least_entropy_increment: np.ndarray
+    entropy_change: np.ndarray
+    entropy_scale: np.ndarray
+    entropy_sensitivity: np.ndarray
+
+    @classmethod
+    def from_solution(cls, solution: AuditedRun) -> RunExtremes:
+        """Return the extremes of a run: those of its statistics, and of the saved states."""
+        stats, energy, evidence = solution.stats, solution.energy_balance, solution.evidence
+        smallest, largest = stats.energy_range or (np.inf, -np.inf)
+        drift = max(largest - energy[0], energy.max() - energy[0], energy[0] - smallest, energy[0] - energy.min())
+        rounding = RoundingScale.from_series(energy, evidence.energy)
+        increment = max([*np.diff(energy), _value_or(stats.largest_energy_increment, -np.inf)])
+        entropy = np.full(1, np.nan) if solution.entropy is None else solution.entropy
+        change = entropy - entropy[0]
+        change = change[np.argmax(np.abs(change))]
+        if solution.laws.entropy == "nondecreasing":
+            change = -(np.maximum.accumulate(entropy) - entropy).max()
+        least_increment = min([*np.diff(entropy), _value_or(stats.least_entropy_increment, np.inf)])
+        entropy_scale = np.abs(entropy).max()
+        values = (
+            max(stats.steps, len(energy) - 1, 1),
+            True,
+            stats.worst_residual,
+            energy[0],
+            drift / rounding.scale,
+            rounding.sensitivity,
+            increment,
+            np.nan if solution.entropy is None else least_increment,
+            change,
+            entropy_scale,
+            _value_or(evidence.entropy, entropy_scale),
+        )
+        return cls(*(np.atleast_1d(value) for value in values))
+
+
+@dataclass(frozen=True, eq=False)
+class LawCheck:
+    """A law of B trajectories, as each of them obeys it.
+
+    Attributes
+    ----------
+    law : str
+    values : ndarray, shape (B,)
+        Measured value along each trajectory, relative to its rounding scale.
+    limits : ndarray, shape (B,), or None
+        Largest value allowed; None if nothing is promised.
+    note : str
+    shown_values, shown_limits : ndarray, shape (B,), or None
+        What a row shows in their place.
+    total_falls : ndarray, shape (B,), or None
+        Falls of the entropy in all that are too large, although each step is within the rounding; zero for others.
+    """
+
+    law: str
+    values: np.ndarray
+    limits: np.ndarray | None
+    note: str = ""
+    shown_values: np.ndarray | None = None
+    shown_limits: np.ndarray | None = None
+    total_falls: np.ndarray | None = None
+
+    @property
+    def is_violated(self) -> np.ndarray:
+        """True for each trajectory that violates the law, shape (B,)."""
+        if self.limits is None:
+            return np.zeros(len(self.values), dtype=bool)
+        is_violated = ~(self.values <= self.limits)
+        return is_violated if self.total_falls is None else is_violated | (self.total_falls > 0.0)
+
+    @property
+    def excess(self) -> np.ndarray:
+        """The values less their limits, shape (B,): the trajectory with the largest excess is the worst."""
+        excess = self.values if self.limits is None else self.values - self.limits
+        return excess if self.total_falls is None else np.where(self.total_falls > 0.0, self.total_falls, excess)
+
+    def audit_row(self, i: int, note: str = "") -> AuditRow:
+        """Return the row of an audit that shows the law for trajectory i."""
+        notes = [self.note, note]
+        if self.total_falls is not None and self.total_falls[i] > 0.0:
+            notes.insert(0, f"in all it falls by {self.total_falls[i]:.2g}")
+        values = self.values if self.shown_values is None else self.shown_values
+        limits = self.limits if self.shown_limits is None else self.shown_limits
+        allowed, passed = (None, None) if limits is None else (float(limits[i]), not self.is_violated[i])
+        return AuditRow(self.law, float(values[i]), allowed, passed, "; ".join(text for text in notes if text))
+
+
+def check_laws(
+    run: Any, laws: Laws, tolerances: Tolerances, terms: Mapping[str, Any], has_entropy: bool
+) -> list[LawCheck]:
+    """Return the laws of trajectories as each obeys them, that of the residual last; without a step all hold.
+
+    Parameters
+    ----------
+    run : RunExtremes, or Ensemble
+    laws : Laws
+        Laws promised of each trajectory.
+    tolerances : Tolerances
+    terms : mapping to float or array, shape (B,)
+        Magnitudes of the largest terms of which "energy" and "entropy" are sums, as far as they are known.
+    has_entropy : bool
+        Whether the entropy has a row if nothing is promised of it.
+    """
+    checks, has_stepped, name = [], run.steps > 0, " minus ".join(["energy", *laws.balance])
+
+    def check(law: str, values, limits, note: str = "", **more) -> LawCheck:
+        limits = None if limits is None else np.where(has_stepped, limits, np.inf)
+        more = {name: np.where(has_stepped, array, 0.0) for name, array in more.items()}
+        return LawCheck(law, np.where(has_stepped, values, 0.0), limits, note, **more)
+
+    rounding = RoundingScale(run.first_energy, run.energy_sensitivity, terms.get("energy", 0.0))
+    allowed, note = rounding.allowed_change(tolerances.energy), _inexact_law_note(laws, "energy")
+    if laws.energy == "conserved":
+        checks.append(check(f"{name} drift", run.energy_drift, allowed, note))
+    elif laws.energy is None:
+        checks.append(check(f"{name} drift", run.energy_drift, None, _why_no_law(laws, "energy")))
+    else:
+        checks.append(check(f"largest {name} increment", run.largest_energy_increment / rounding.scale, allowed, note))
+    rounding = RoundingScale(run.entropy_scale, run.entropy_sensitivity, terms.get("entropy", 0.0))
+    least, note = run.least_entropy_increment, _inexact_law_note(laws, "entropy")
+    allowed, allowed_in_all = (rounding.allowed_change(t) for t in (tolerances.entropy, tolerances.casimirs))
+    if laws.entropy == "conserved":
+        change = np.maximum(np.abs(run.entropy_change), -least) / rounding.scale
+        checks.append(check("entropy drift", change, allowed_in_all, note))
+    elif laws.entropy == "nondecreasing":
+        fall, is_step_allowed = -run.entropy_change, -least / rounding.scale <= allowed
+        falls_in_all = np.where(is_step_allowed & (fall > allowed_in_all * rounding.scale), fall, 0.0)
+        shown = {"shown_values": least, "shown_limits": -allowed * rounding.scale, "total_falls": falls_in_all}
+        checks.append(check("least entropy increment", -least / rounding.scale, allowed, note, **shown))
+    elif has_entropy:
+        checks.append(check("least entropy increment", -least, None, _why_no_law(laws, "entropy"), shown_values=least))
+    return [*checks, check("stage residual", np.where(run.ok, run.residual, 0.0), tolerances.residual)]
+
+
 def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
     """Audit a run: see :meth:`liethermo.Solution.audit`."""
-    stats, laws, evidence, rows, energy = solution.stats, solution.laws, solution.evidence, [], solution.energy_balance
-    name = " minus ".join(["energy", *laws.balance])
-    min_step_energy, max_step_energy = stats.energy_range or (np.inf, -np.inf)
-    min_energy, max_energy = min(min_step_energy, float(energy.min())), max(max_step_energy, float(energy.max()))
-    initial_energy = float(energy[0])
-    rounding = RoundingScale.from_series(energy, evidence.energy, evidence.terms.get("energy"))
-    drift = float(max(max_energy - initial_energy, initial_energy - min_energy) / rounding.scale)
-    allowed = float(rounding.allowed_change(tolerances.energy))
-    if laws.energy == "conserved":
-        rows.append(_judged_row(f"{name} drift", drift, allowed, _inexact_law_note(laws, "energy")))
-    elif laws.energy is None:
-        rows.append(AuditRow(f"{name} drift", drift, None, None, _why_no_law(laws, "energy")))
-    else:
-        increments = [*np.diff(energy), _value_or(stats.largest_energy_increment, -np.inf)]
-        relative_increment = float(max(increments)) / rounding.scale
-        rows.append(
-            _judged_row(f"largest {name} increment", relative_increment, allowed, _inexact_law_note(laws, "energy"))
-        )
-
-    min_entropy_increment = np.nan
-    if solution.entropy is not None:
-        min_entropy_increment, row = _entropy_row(solution, tolerances)
-        rows.append(row)
-
+    stats, laws, evidence = solution.stats, solution.laws, solution.evidence
+    extremes = RunExtremes.from_solution(solution)
+    checks = check_laws(extremes, laws, tolerances, evidence.terms, solution.entropy is not None)
+    *rows, residual_row = (check.audit_row(0) for check in checks)
     drifts = []
     for name, series in solution.casimirs.items():
         if name in laws.ledger:
@@ -264,7 +392,7 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
                 f"received from outside; already subtracted in the {law_name} row",
             )
         )
-    rows.append(_judged_row("stage residual", stats.worst_residual, tolerances.residual))
+    rows.append(residual_row)
     if stats.attitude_residual is not None:
         rows.append(_judged_row("attitude in group", stats.attitude_residual, tolerances.attitude))
     if stats.spatial_momentum_change is not None:
@@ -283,7 +411,14 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
         )
     )
     coverage = coverage_text(evidence, stats.steps)
-    return Audit(drift, min_entropy_increment, max(drifts, default=np.nan), stats.worst_residual, tuple(rows), coverage)
+    return Audit(
+        float(extremes.energy_drift[0]),
+        float(extremes.least_entropy_increment[0]),
+        max(drifts, default=np.nan),
+        stats.worst_residual,
+        tuple(rows),
+        coverage,
+    )
 
 
 def invariant_row(law: str, drift: InvariantDrift, tolerances: Tolerances, note: str = "") -> AuditRow:
@@ -310,35 +445,6 @@ UNKNOWN_CONSTANCY_NOTE = (
 
 UNPROMISED_CONSTANT_NOTE = "a constant of this system, but the method does not conserve it exactly"
 """Note of a conserved function that the method does not conserve exactly."""
-
-
-def _entropy_row(solution: AuditedRun, tolerances: Tolerances) -> tuple[float, AuditRow]:
-    """Return the smallest increment of the entropy and the row of its law, for every step and for the whole run."""
-    S, law = solution.entropy, solution.laws.entropy
-    assert S is not None
-    note, evidence = _inexact_law_note(solution.laws, "entropy"), solution.evidence
-    drift = InvariantDrift.from_series(S, evidence.entropy, evidence.terms.get("entropy"))
-    min_increment = float(min([*np.diff(S), _value_or(solution.stats.least_entropy_increment, np.inf)]))
-    if law == "conserved":
-        return min_increment, invariant_row("entropy drift", drift, tolerances, note)
-    if law is None:
-        return min_increment, AuditRow(
-            "least entropy increment", min_increment, None, None, _why_no_law(solution.laws, "entropy")
-        )
-    rounding = replace(drift.rounding, value=float(np.abs(S).max()))
-    step_tolerance, total_tolerance = (
-        float(rounding.allowed_change(t) * rounding.scale) for t in (tolerances.entropy, tolerances.casimirs)
-    )
-    fall = float((np.maximum.accumulate(S) - S).max())
-    if fall > total_tolerance >= 0.0 and min_increment >= -step_tolerance:  # each step is within the rounding
-        note = f"in all it falls by {fall:.2g}"
-    return min_increment, AuditRow(
-        "least entropy increment",
-        min_increment,
-        -step_tolerance,
-        bool(min_increment >= -step_tolerance and fall <= total_tolerance),
-        note,
-    )
 
 
 def _accuracy_and_consistency_rows(evidence: Evidence, tolerances: Tolerances) -> list[AuditRow]:

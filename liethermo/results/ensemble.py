@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,12 +21,12 @@ from .audit import (
     AuditRow,
     Tolerances,
     accuracy_row,
+    check_laws,
     condition_rows,
     coverage_text,
     invariant_row,
 )
-from .audit_evidence import VELOCITY_AXES, AuditableResult, Evidence, copies_of_velocities, merge_evidence
-from .ensemble_laws import evaluate_ensemble_laws
+from .audit_evidence import AuditableResult, Evidence, copies_of_velocities
 from .events import Events
 from .netcdf import (
     ENSEMBLE_FORMAT,
@@ -331,14 +331,12 @@ class Ensemble(AuditableResult):
             If the name of a tolerance is unknown, or a tolerance is negative.
         """
         limits = Tolerances.with_defaults(energy=energy, entropy=entropy, **tolerances)
-        has_stepped, terms = self.steps > 0, self.evidence.terms
-        rows = []
-        for law in evaluate_ensemble_laws(self, self.laws, limits, terms.get("energy", 0.0), terms.get("entropy", 0.0)):
-            i = law.worst_member
-            rows.append(law.audit_row(i, f"worst is trajectory {i}"))
-        drifts = self.evidence.drifts
+        has_stepped, drifts = self.steps > 0, self.evidence.drifts
+        checks = check_laws(self, self.laws, limits, self.evidence.terms, self.entropy is not None)
+        worst = [(check, int(np.argmax(check.excess))) for check in checks]
+        *rows, residual_row = (check.audit_row(i, f"worst is trajectory {i}") for check, i in worst)
         rows += [invariant_row(f"drift of {name}", drift, limits) for name, drift in drifts.items()]
-        rows += condition_rows(self.evidence)
+        rows += [residual_row, *condition_rows(self.evidence)]
         if self.evidence_source is not None or self.evidence.local_error is not None:
             rows.append(accuracy_row(self.evidence, limits))
         n_failed = int((~self.ok & (self.status != StatusCode.INTERRUPTED)).sum())
@@ -454,96 +452,3 @@ PER_MEMBER_FIELDS = tuple(
 
 REQUIRED_FIELDS = ("energy", "x0", *PER_MEMBER_FIELDS)
 """Fields that every ensemble has."""
-
-STATE_FIELDS = ("x", "x0", "attitude", "attitude0")
-"""Fields that are arrays of states, trajectories first."""
-
-
-class Subset(NamedTuple):
-    """Subset of the trajectories of an ensemble.
-
-    Attributes
-    ----------
-    trajectory_numbers : array of int
-        Indices of the trajectories in the full ensemble, increasing.
-    ensemble : Ensemble
-    """
-
-    trajectory_numbers: np.ndarray
-    ensemble: Ensemble
-
-
-def join_subsets(subsets: Sequence[Subset], n_trajectories: int, **fields: Any) -> Ensemble:
-    """Return the ensemble of all trajectories; those in no subset are inadmissible.
-
-    Parameters
-    ----------
-    subsets : sequence of Subset
-        At least one.
-    n_trajectories : int
-        Number of trajectories of the full ensemble.
-    fields
-        Attributes ``reasons``, ``wall_time`` and ``provenance`` of the result.
-    """
-    ensembles = [subset.ensemble for subset in subsets]
-    first_ensemble = ensembles[0]
-    engine = " and ".join(sorted({e.engine for e in ensembles}))
-    fields["provenance"] = {**fields["provenance"], "engine": engine}
-    if len(ensembles) == 1 and len(first_ensemble) == n_trajectories:
-        return replace(first_ensemble, **fields)
-
-    def joined_field(name: str) -> np.ndarray | None:
-        values = getattr(first_ensemble, name)
-        if values is None:
-            return None
-        fill_value = {"status": StatusCode.INADMISSIBLE}.get(name, 0 if values.dtype.kind == "i" else np.nan)
-        joined = np.full((n_trajectories, *values.shape[1:]), fill_value, dtype=values.dtype)
-        for subset, ensemble in zip(subsets, ensembles, strict=True):
-            joined[subset.trajectory_numbers] = getattr(ensemble, name)
-        return joined
-
-    def build_solution(ensemble: Ensemble, i: int) -> Solution:
-        member_subset = next(subset for subset in subsets if i in subset.trajectory_numbers)
-        assert member_subset.ensemble.solution_builder is not None
-        return member_subset.ensemble.solution_builder(ensemble, i)
-
-    evidence_sources = [e.evidence_source for e in ensembles]
-    conserved = [set(e.laws.conserved) for e in ensembles]
-    promised = set.intersection(*conserved)
-    not_promised = [name for e in ensembles for name in (*e.laws.conserved, *e.laws.unpromised) if name not in promised]
-    laws = replace(
-        first_ensemble.laws,
-        conserved=tuple(name for name in first_ensemble.laws.conserved if name in promised),
-        unpromised=tuple(dict.fromkeys(not_promised)),
-    )
-    joined_fields: dict[str, Any] = {
-        name: joined_field(name) for name in (*STATE_FIELDS, *TIME_SERIES_FIELDS, *PER_MEMBER_FIELDS)
-    }
-    return replace(
-        first_ensemble,
-        **joined_fields,
-        laws=laws,
-        engine=engine,
-        events=Events.join((subset.trajectory_numbers, subset.ensemble.events) for subset in subsets),
-        evidence_source=None
-        if None in evidence_sources
-        else lambda: merge_evidence(
-            [evidence_source() for evidence_source in evidence_sources if evidence_source is not None]
-        ),
-        velocity_sources={
-            name: partial(_join_velocities, name, subsets, n_trajectories)
-            for name in VELOCITY_AXES
-            if all(name in subset.ensemble.velocity_sources for subset in subsets)
-        },
-        solution_builder=build_solution,
-        **fields,
-    )
-
-
-def _join_velocities(name: str, subsets: Sequence[Subset], n_trajectories: int) -> np.ndarray:
-    """Return the velocities of a name of all trajectories, shape (n_trajectories, ...)."""
-    parts = [(subset.trajectory_numbers, subset.ensemble.velocity_sources[name]()) for subset in subsets]
-    joined = np.full((n_trajectories, *parts[0][1].shape[1:]), np.nan)
-    for numbers, values in parts:
-        joined[numbers] = values
-    return joined

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,20 +57,6 @@ class Events(tuple[EventSeries, ...]):
             )
             for series in self
         )
-
-    @classmethod
-    def join(cls, parts: Iterable[tuple[np.ndarray, Events]]) -> Events:
-        """Return the events of an ensemble from those of subsets, each with the numbers of its trajectories."""
-        numbered = [
-            [series._replace(trajectory=numbers[series.trajectory]) for series in events] for numbers, events in parts
-        ]
-        series_of_all = []
-        for series_of_parts in zip(*numbered, strict=True):
-            columns = zip(*(series[1:] for series in series_of_parts), strict=True)
-            t, x, trajectory = (np.concatenate(arrays) for arrays in columns)
-            order = np.lexsort([t, trajectory])
-            series_of_all.append(EventSeries(series_of_parts[0].name, t[order], x[order], trajectory[order]))
-        return cls(series_of_all)
 
     # -- files --------------------------------------------------------------------------------------------------------
 

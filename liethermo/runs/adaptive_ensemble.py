@@ -12,7 +12,6 @@ from ..engines.compiled.lanes import CompiledAdaptiveRuns
 from ..engines.status_codes import StatusCode
 from ..engines.step import REPORTED_FIELDS
 from ..engines.step_control import StepControl
-from ..integrators import OneStepMethod
 from ..systems import System
 from .driver import drive_adaptive
 from .ensemble_lanes import (
@@ -23,9 +22,7 @@ from .ensemble_lanes import (
     padded_member_indices,
     run_in_threads,
 )
-from .events import EventSet
-from .record import EnsembleRecord
-from .system_family import Family
+from .record import GroupRecord
 
 ATTEMPTS_PER_CALL_RANGE = (16, 2048)
 """Smallest and largest number of attempted steps per engine call; paused trajectories wait until the call ends."""
@@ -43,37 +40,19 @@ RUNNING_CODES = (StatusCode.COMPLETED, StatusCode.PAUSED_AT_STOP, StatusCode.PAU
 
 
 class AdaptiveEnsembleRun:
-    """Run of an ensemble with adaptive steps or events.
+    """Run of a group of trajectories of an ensemble with adaptive steps or events.
 
     Parameters
     ----------
-    family : Family
-    method : OneStepMethod
+    record : GroupRecord
     control : StepControl
-    record : EnsembleRecord
+        The control of the group.
     progress_counter : ProgressCounter
-    events : EventSet, optional
-        The events whose functions the control has.
     """
 
-    def __init__(
-        self,
-        family: Family,
-        method: OneStepMethod,
-        control: StepControl,
-        record: EnsembleRecord,
-        progress_counter: ProgressCounter,
-        events: EventSet | None = None,
-    ):
-        self.family, self.method, self.control, self.record, self.progress_counter = (
-            family,
-            method,
-            control,
-            record,
-            progress_counter,
-        )
-        self.events = events
-        self.interrupted = False
+    def __init__(self, record: GroupRecord, control: StepControl, progress_counter: ProgressCounter):
+        self.family, self.method, self.events, self.control = record.family, record.method, record.events, control
+        self.record, self.progress_counter, self.interrupted = record, progress_counter, False
         self.stop_times = record.schedule.stop_times
 
     @property
@@ -193,7 +172,7 @@ class _BatchRecorder:
             is_pending &= ~is_accepted
             if not (is_pending & (runs.read("status") == StatusCode.COMPLETED)).any():
                 break
-        self.record.quantities["first_step"][self.members] = sizes
+        self.record.store_first_steps(self.members, sizes)
 
     def record_pauses(self) -> None:
         handler, runs = self.pause_handler, self.runs
@@ -232,5 +211,5 @@ class _BatchRecorder:
         runs, members = self.runs, self.members[indices]
         initial = {name: values[indices] for name, values in self.initial.items()}
         final = {name: runs.read(name, indices) for name in REPORTED_FIELDS}
-        self.record.finish_members(members, initial, final, status, runs.read("t", indices))
-        self.record.rejected[members] = runs.read("n_rejected", indices)
+        end_time, n_rejected = runs.read("t", indices), runs.read("n_rejected", indices)
+        self.record.finish_members(members, initial, final, status, end_time, n_rejected)

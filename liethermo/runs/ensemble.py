@@ -12,37 +12,34 @@ import numpy as np
 from manifolds._precision import with_library_settings
 
 from ..engines.select_engine import is_worth_compiling, warn_of_fallback
-from ..engines.status_codes import StatusCode
 from ..errors import InputError
 from ..functions.time_span import DeclaredTimes
-from ..integrators import DEFAULT_METHOD, OneStepMethod
+from ..integrators import OneStepMethod
 from ..integrators.fluctuating import noise_dimension
-from ..results.ensemble import Ensemble, Subset, join_subsets
-from ..results.events import Events
+from ..results.ensemble import Ensemble
 from ..systems import System
 from ..systems.rotations import attitude_array
 from ..tracing.scalarize import UnsupportedPrimitive
 from .adaptive import Adaptive, make_step_control
 from .adaptive_ensemble import AdaptiveEnsembleRun
 from .ensemble_lanes import MAX_THREADS, FixedEnsembleRun, ProgressCounter, replay_steps
-from .events import EventSet, Until, collect_events
+from .events import EventSet, Until
 from .member_groups import common_inertia, group_members_by_invariants, members_outside_domain
-from .noise import DEFAULT_NOISE_METHOD, Fluctuations, NoisePaths, check_noise
+from .noise import Fluctuations, NoisePaths, check_noise
 from .preparation import (
     check_choice,
+    check_steps,
+    checked_method,
     initial_state,
-    is_driven_run,
     limit_family_to_span,
     limit_to_span,
-    prepare_system_and_method,
-    promised_laws,
     refuse_tracers,
-    resolve_invariants,
     why_not_startable,
     wrap_family,
 )
+from .problem import Problem
 from .progress import Progress
-from .record import EnsembleEvidenceCollector, EnsembleRecord, MemberSolutionBuilder
+from .record import EnsembleRecord, GroupRecord, TrajectoryGroup
 from .schedule import StepSchedule, make_schedule
 from .solution_builder import run_provenance
 from .system_family import Family, broadcast_size, error_message_of
@@ -52,9 +49,6 @@ __all__ = ["MAX_THREADS", "Ensemble", "ensemble"]
 
 DOMAIN_CHECK_BATCH_SIZE = 8192
 """Largest number of initial states that are checked together, which bounds memory."""
-
-MAX_REPLAYED_STEPS = 256
-"""Largest number of steps of a trajectory that an audit replays on the array engine, whose steps are slow."""
 
 
 @with_library_settings
@@ -134,21 +128,15 @@ def ensemble(
     ((100,), True)
     """
     start_time = time.perf_counter()
-    method = (DEFAULT_METHOD if noise is None else DEFAULT_NOISE_METHOD) if method is None else method
-    if not isinstance(method, OneStepMethod):
-        raise InputError(f"method must be an integrator such as lt.MetriplecticGauss(), got {method!r}")
+    method = checked_method(method, noise)
     outputs = outputs or ("final" if save_at is None else "trajectory")
     check_choice("outputs", outputs, ("final", "trajectory", "summary"))
     check_choice("engine", engine, ("auto", "array", "compiled"))
     if save_at is not None and outputs != "trajectory":
         raise InputError(f'save_at needs outputs="trajectory", got {outputs!r}')
-    has_step_control = isinstance(step, Adaptive) or until is not None
-    if has_step_control and outputs == "trajectory" and save_at is None:
+    if (isinstance(step, Adaptive) or until is not None) and outputs == "trajectory" and save_at is None:
         raise InputError('outputs="trajectory" with adaptive steps or events needs save_at, common times to save')
-    if has_step_control and noise is not None:
-        raise InputError(
-            "noise= needs fixed steps and cannot be combined with Adaptive or until. Give the step as a number"
-        )
+    check_steps(method, step, noise, until)
     family = Family.from_arguments(system, parameters)
     save_every_step = save_every if outputs == "trajectory" and save_at is None else None
     declared = DeclaredTimes.from_tree(family.with_unknown_parameters())
@@ -161,43 +149,36 @@ def ensemble(
     if reasons:
         started_numbers = np.setdiff1d(started_numbers, list(reasons))
         family, states = family.select(started_numbers), states[started_numbers]
-    options = _EnsembleOptions(method, step, schedule, outputs, engine, until, noise)
+    options = _EnsembleOptions(method, step, schedule, engine, until, noise)
     provenance = run_provenance(
         family.representative,
         method,
         step if isinstance(step, Adaptive) else schedule.h,
         (schedule.start, schedule.end),
         schedule.save_every,
+        noise=None if noise is None else noise.to_provenance(),
     )
     inertia = common_inertia(family)
     provenance["inertia"] = None if inertia is None else inertia.tolist()
-    groups, refusal_reasons = group_members_by_invariants(family, method, states)
+    member_groups, refusal_reasons = group_members_by_invariants(family, method, states)
     reasons = dict(reasons) | {int(started_numbers[i]): text for i, text in refusal_reasons.items()}
-    subsets: list[Subset] = []
-    with Progress((0, len(started_numbers)), progress, "{:.0f} trajectories") as bar:
-        for member_indices, group in groups:
-            group_attitude = (
-                np.asarray(attitude)[started_numbers[member_indices]]
-                if np.ndim(attitude) == 3 and len(attitude) > 1
-                else attitude
-            )
-            n_done = sum(len(part.trajectory_numbers) for part in subsets)
-            is_interrupted = any((part.ensemble.status == StatusCode.INTERRUPTED).any() for part in subsets)
-            report = functools.partial(_update_progress, bar, n_done)
-            subset, group_reasons = options.run_group(
-                group, states[member_indices], started_numbers[member_indices], group_attitude, report, is_interrupted
-            )
-            subsets += [] if subset is None else [subset]
-            reasons |= group_reasons
-    if not subsets:
+    groups: list[TrajectoryGroup] = []
+    for member_indices, group_family in member_groups:
+        numbers = started_numbers[member_indices]
+        group_attitude = np.asarray(attitude)[numbers] if np.ndim(attitude) == 3 and len(attitude) > 1 else attitude
+        group, group_reasons = options.prepare_group(group_family, states[member_indices], numbers, group_attitude)
+        groups += [] if group is None else [group]
+        reasons |= group_reasons
+    if not groups:
         raise InputError(f"no trajectory can be started; trajectory {min(reasons)}: {reasons[min(reasons)]}")
-    return join_subsets(
-        subsets,
-        n_trajectories,
-        reasons=reasons,
-        wall_time=time.perf_counter() - start_time,
-        provenance={**provenance, "noise": None if noise is None else noise.to_provenance()},
-    )
+    record, n_done = EnsembleRecord(groups, n_trajectories, outputs), 0
+    with Progress((0, len(started_numbers)), progress, "{:.0f} trajectories") as bar:
+        for group_record in record.groups:
+            options.run_group(group_record, functools.partial(_update_progress, bar, n_done))
+            if group_record.is_interrupted:
+                break
+            n_done += len(group_record.numbers)
+    return record.to_ensemble(replay_steps, reasons, provenance, wall_time=time.perf_counter() - start_time)
 
 
 def _update_progress(bar: Progress, n_done: int, n_more: float) -> None:
@@ -210,117 +191,84 @@ class _EnsembleOptions(NamedTuple):
     method: OneStepMethod
     step: float | Adaptive
     schedule: StepSchedule
-    outputs: str
     engine: str
     until: Any
     noise: Fluctuations | None
 
-    def run_group(
-        self,
-        family: Family,
-        states: np.ndarray,
-        trajectory_numbers: np.ndarray,
-        attitude,
-        report: Callable[[float], None],
-        is_interrupted: bool,
-    ) -> tuple[Subset | None, dict[int, str]]:
-        """Run a group of trajectories; return their results, or None if none can start, and the reasons of failures.
+    def prepare_group(
+        self, family: Family, states: np.ndarray, numbers: np.ndarray, attitude
+    ) -> tuple[TrajectoryGroup | None, dict[int, str]]:
+        """Return a group of trajectories as it is run, or None if none can start, and why some cannot.
 
-        The reasons belong to trajectories that could not start or have failed, by their numbers.
+        The reasons belong to trajectories by their numbers.
 
         Parameters
         ----------
         states : array, shape (B, n)
             Initial states.
-        trajectory_numbers : array of int, shape (B,)
+        numbers : array of int, shape (B,)
             The numbers of the trajectories in the ensemble.
         attitude : array, shape (m, m) or (B, m, m), or None
-        report : function
-            Called with the number of finished trajectories.
-        is_interrupted : bool
-            True after the user has interrupted the ensemble; then no step is taken.
         """
         step, schedule, noise = self.step, self.schedule, self.noise
-        member = resolve_invariants(family.member(0), states)
         tolerance = step.tolerance if isinstance(step, Adaptive) else None
-        member, method = prepare_system_and_method(member, self.method, noise, tolerance)
-        family = wrap_family(family, member)
-        states = np.asarray(initial_state(member, states, schedule.start, attitude, batch=True))
-        method.check(member)
-        span = schedule.start, schedule.end, *schedule.breaks
-        family, member = limit_family_to_span(family, member, *span), limit_to_span(member, *span)
+        problem = Problem.from_user(family.member(0), self.method, noise, tolerance, states)
+        method, family = problem.method, wrap_family(family, problem.system)
+        states = np.asarray(initial_state(problem.system, states, schedule.start, attitude, batch=True))
+        family_in_span = limit_family_to_span(family, problem.system, schedule)
+        member = problem.system_in_span(schedule)
         reasons = {
-            int(trajectory_numbers[i]): text for i, text in _unstartable_members(family, member, method, states).items()
+            int(numbers[i]): text for i, text in _unstartable_members(family_in_span, member, method, states).items()
         }
         if reasons:
-            startable = np.flatnonzero(~np.isin(trajectory_numbers, list(reasons)))
-            trajectory_numbers, family, states = (
-                trajectory_numbers[startable],
-                family.select(startable),
-                states[startable],
-            )
-            if not len(trajectory_numbers):
+            startable = np.flatnonzero(~np.isin(numbers, list(reasons)))
+            numbers, family, states = numbers[startable], family.select(startable), states[startable]
+            if not len(numbers):
                 return None, reasons
-        if is_driven_run(member):
+            family_in_span = family_in_span.select(startable)
+        if problem.is_driven:
             members = family.members_with_extreme_parameters()[: len(states)]
-            systems = [limit_to_span(family.member(i), *span) for i in members]
+            systems = [limit_to_span(family.member(i), schedule) for i in members]
             schedule = schedule_around_features(schedule, systems, states[members], step)
             if schedule is not self.schedule:
-                span = schedule.start, schedule.end, *schedule.breaks
-                family, member = limit_family_to_span(family, member, *span), limit_to_span(member, *span)
-        noise_paths = (
-            None
-            if noise is None or not noise_dimension(method)
-            else NoisePaths(noise, noise_dimension(method), trajectory_numbers, schedule)
-        )
-        record = EnsembleRecord(
-            family, member, states, schedule, self.outputs, np.nan if tolerance is not None else schedule.h
-        )
+                family_in_span = limit_family_to_span(family, problem.system, schedule)
+                member = problem.system_in_span(schedule)
         events = None if self.until is None else EventSet(self.until, member, schedule.start, states[0])
-        has_step_control = tolerance is not None or events is not None
-        control = make_step_control(step, method, schedule.end - schedule.start, events) if has_step_control else None
+        control = noise_paths = None
+        if tolerance is not None or events is not None:
+            control = make_step_control(step, method, schedule.end - schedule.start, events)
+        if noise is not None and noise_dimension(method):
+            noise_paths = NoisePaths(noise, noise_dimension(method), numbers, schedule)
+        h = schedule.h if tolerance is None else np.nan
+        group = TrajectoryGroup(
+            numbers, problem, family_in_span, member, states, schedule, h, control, events, noise_paths
+        )
+        return group, reasons
 
-        def run_with_engine(engine: str, progress_counter: ProgressCounter) -> None:
-            if is_interrupted:
-                return
+    def run_group(self, record: GroupRecord, report: Callable[[float], None]) -> None:
+        """Run a group of trajectories; ``report`` is called with the number of finished ones."""
+
+        def run_with_engine(engine: str) -> None:
+            progress_counter, record.engine = ProgressCounter(report), engine
             run = (
-                FixedEnsembleRun(family, method, record, progress_counter, noise_paths)
-                if control is None
-                else AdaptiveEnsembleRun(family, method, control, record, progress_counter, events)
+                FixedEnsembleRun(record, progress_counter)
+                if record.control is None
+                else AdaptiveEnsembleRun(record, record.control, progress_counter)
             )
             (run.run_compiled if engine == "compiled" else run.run_array)()
 
-        calls_python = events is not None and events.calls_python
-        prefers_compiled = self.engine == "auto" and is_worth_compiling(member) and not calls_python
-        engine_name = "compiled" if self.engine == "compiled" or prefers_compiled else "array"
-        if engine_name == "compiled":
+        calls_python = record.events is not None and record.events.calls_python
+        prefers_compiled = self.engine == "auto" and is_worth_compiling(record.member) and not calls_python
+        if self.engine == "compiled" or prefers_compiled:
             try:
-                run_with_engine(engine_name, ProgressCounter(report))
+                run_with_engine("compiled")
             except UnsupportedPrimitive as error:
                 if self.engine == "compiled":
                     raise
                 warn_of_fallback(error)
-                engine_name = "array"
-        if engine_name == "array":
-            run_with_engine(engine_name, ProgressCounter(report))
-        record.set_unfinished_to_nan()
-        max_replayed_steps = schedule.n_steps if engine_name == "compiled" else MAX_REPLAYED_STEPS
-        replay = functools.partial(replay_steps, engine_name)
-        n_equal_steps = 1 if tolerance is not None else min(schedule.segments[0].n_full_steps, max_replayed_steps)
-        result = record.to_ensemble(
-            reasons={},
-            laws=promised_laws(member, method, {}),
-            engine=engine_name,
-            wall_time=0.0,
-            evidence_source=None
-            if noise_dimension(method)
-            else EnsembleEvidenceCollector(record, method, replay, n_equal_steps),
-            solution_builder=MemberSolutionBuilder(record, method, trajectory_numbers),
-            events=Events() if events is None else collect_events(member, events.names, record.events),
-        )
-        return Subset(trajectory_numbers, result), reasons | {
-            int(trajectory_numbers[j]): text for j, text in record.failure_reasons.items()
-        }
+            else:
+                return
+        run_with_engine("array")
 
 
 def _checked_initial_states(family: Family, x0s, n_attitudes: int) -> tuple[np.ndarray, Mapping[int, str]]:

@@ -22,8 +22,7 @@ from ..engines.step import REPORTED_FIELDS
 from ..engines.step_control import StepControl
 from ..integrators import OneStepMethod
 from .driver import drive_fixed
-from .noise import NoisePaths
-from .record import EnsembleRecord
+from .record import GroupRecord
 from .schedule import CHUNK_STEPS, EngineCall
 from .system_family import Family
 
@@ -152,26 +151,16 @@ def padded_member_indices(start: int, stop: int, dim: int) -> np.ndarray:
 
 
 class FixedEnsembleRun:
-    """Run of an ensemble with fixed steps.
+    """Run of a group of trajectories of an ensemble with fixed steps.
 
     Parameters
     ----------
-    family : Family
-    method : OneStepMethod
-    record : EnsembleRecord
+    record : GroupRecord
     progress_counter : ProgressCounter
-    noise : NoisePaths, optional
     """
 
-    def __init__(
-        self,
-        family: Family,
-        method: OneStepMethod,
-        record: EnsembleRecord,
-        progress_counter: ProgressCounter,
-        noise: NoisePaths | None = None,
-    ):
-        self.family, self.method, self.record, self.noise = family, method, record, noise
+    def __init__(self, record: GroupRecord, progress_counter: ProgressCounter):
+        self.family, self.method, self.record, self.noise = record.family, record.method, record, record.noise
         self.progress_counter, self._is_interrupted = progress_counter, False
 
     def run_compiled(self) -> None:

@@ -32,14 +32,14 @@ from ..engines.step import (
 )
 from ..errors import InputError
 from ..functions.time_span import DeclaredTimes
-from ..integrators import DEFAULT_METHOD, OneStepMethod
+from ..integrators import OneStepMethod
 from ..systems import System
 from ..systems.clock import system_of_step
 from ..tracing.programs import jit_cached, jit_unoptimised
 from .adaptive import Adaptive
 from .flow_derivatives import state_derivatives
 from .flow_times import checked_save_times, states_at_times, system_with_parameters
-from .preparation import checked_initial_state, initial_state, limit_to_span, prepare_for_method
+from .preparation import checked_initial_state, checked_method, initial_state, limit_to_span, prepare_for_method
 from .schedule import StepSchedule, make_schedule
 
 
@@ -127,9 +127,9 @@ def flow(
     ... ).shape
     (3, 3)
     """
-    method = DEFAULT_METHOD if method is None else method
+    method = checked_method(method)
     system = system_with_parameters(system, parameters)
-    _check_arguments(system, t_span, step, method)
+    _check_arguments(system, t_span, step)
     if save_at is not None and save_every is not None:
         raise InputError("flow takes save_at or save_every, got both. Remove one of them")
     save_every = 1 if save_at is not None else save_every
@@ -138,7 +138,7 @@ def flow(
     times = None if save_at is None else checked_save_times(save_at, schedule)
     n, user_system = system.dim, system
     system, method = prepare_for_method(system, method, None, attitude is not None)
-    system = limit_to_span(system, schedule.start, schedule.end, *schedule.breaks)
+    system = limit_to_span(system, schedule)
     initial_arguments = x, schedule.start, attitude
     # the values of a traced state are unknown, so it cannot be checked
     x = jnp.asarray(
@@ -201,12 +201,10 @@ def _states_at_times(system, method, path, grid, times, span: tuple[float, float
     return states_at_times(system, method, path, grid, times, span, end_state)
 
 
-def _check_arguments(system, t_span, step, method) -> None:
+def _check_arguments(system, t_span, step) -> None:
     """Raise InputError if the arguments do not belong to a run with fixed steps."""
     if not isinstance(system, System):
         raise InputError(f"flow needs a system such as lt.models.rigid_body(), got {type(system).__name__}")
-    if not isinstance(method, OneStepMethod):
-        raise InputError(f"method must be a OneStepMethod such as lt.MetriplecticGauss(2), got {method!r}")
     if isinstance(step, Adaptive):
         raise InputError("flow needs a fixed step, a number, got lt.Adaptive. For adaptive steps use lt.integrate")
     if is_traced(t_span, step):

@@ -14,7 +14,7 @@ from manifolds._arrays import is_traced
 from ..errors import FunctionError, InputError
 from ..functions.checks import trace_energies
 from ..functions.time_span import set_time_span
-from ..integrators import OneStepMethod, WithAttitude
+from ..integrators import DEFAULT_METHOD, OneStepMethod, Reference, WithAttitude
 from ..integrators.base import pullback_method
 from ..integrators.fluctuating import noise_dimension
 from ..results.status import Laws
@@ -34,7 +34,9 @@ from ..systems.transport import has_generator
 from ..tracing.caching import LRUCache, memoize
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import is_library_object
-from .noise import Fluctuations
+from .adaptive import Adaptive
+from .noise import DEFAULT_NOISE_METHOD, Fluctuations
+from .schedule import StepSchedule
 from .system_family import Family
 
 Result = TypeVar("Result")
@@ -44,6 +46,15 @@ MISSING_GROUP_MESSAGE = (
     "attitude=True"
 )
 """Error message for an attitude of a system without a group."""
+
+
+REFERENCE_STEPS = (
+    "Reference chooses its own steps and cannot be combined with Adaptive, save_at, until or dense. Use another method"
+)
+"""Error message for options that need steps of the library's own methods."""
+
+NOISY_STEPS = "noise= needs fixed steps and cannot be combined with Adaptive, until or dense. Give the step as a number"
+"""Error message for options that a run with noise does not have."""
 
 
 def refuse_tracers(function: Callable[..., Result]) -> Callable[..., Result]:
@@ -68,6 +79,32 @@ def check_choice(name: str, value, choices: tuple[str, ...]) -> None:
     if value not in choices:
         *leading_choices, last_choice = map(repr, choices)
         raise InputError(f"{name} must be {', '.join(leading_choices)} or {last_choice}, got {value!r}")
+
+
+def checked_method(method, noise: Fluctuations | None = None, *, runs_alone: bool = False) -> Any:
+    """Return the method of a run, the default one for None.
+
+    Raises
+    ------
+    InputError
+        If it is no method, or the run is not one of a single trajectory (``runs_alone``) and the method is Reference.
+    """
+    if method is None:
+        return DEFAULT_METHOD if noise is None else DEFAULT_NOISE_METHOD
+    if not isinstance(method, OneStepMethod | Reference):
+        raise InputError(f"method must be an integrator such as lt.MetriplecticGauss(), got {method!r}")
+    if isinstance(method, Reference) and not runs_alone:
+        raise InputError("Reference runs single trajectories, with lt.integrate or a propagator. Use another method")
+    return method
+
+
+def check_steps(method, step, noise: Fluctuations | None, until=None, dense: bool = False, save_at=None) -> None:
+    """Raise InputError if the method or the noise of a run does not go with its step, or with its other options."""
+    is_examined = isinstance(step, Adaptive) or until is not None or dense
+    if isinstance(method, Reference) and (is_examined or save_at is not None):
+        raise InputError(REFERENCE_STEPS)
+    if noise is not None and is_examined:
+        raise InputError(NOISY_STEPS)
 
 
 def resolve_invariants(system: System, x0) -> System:
@@ -171,25 +208,26 @@ MAX_LIMITED_SYSTEMS = 64
 _limited_systems: LRUCache[tuple[System, System]] = LRUCache(MAX_LIMITED_SYSTEMS)
 
 
-def limit_to_span(system: System, start: float, end: float, *breaks: float) -> System:
-    """Return the prepared system with its functions of time evaluated only at times from ``start`` to ``end``.
+def limit_to_span(system: System, schedule: StepSchedule) -> System:
+    """Return the prepared system with its functions of time evaluated only at times within the span of a schedule.
 
-    At the ``breaks`` within the span functions of time may jump. Equal arguments return the same object, so that cached
+    At the breaks within the span functions of time may jump. Equal arguments return the same object, so that cached
     results are shared.
     """
+    span = schedule.start, schedule.end, *schedule.breaks
     if not is_driven_run(system):
         return system
     if is_traced(system):
-        return set_time_span(system, start, end, *breaks)
+        return set_time_span(system, *span)
     # the value holds the system, so that its id stays its own
-    return _limited_systems.get_or_compute(
-        (id(system), start, end, breaks), lambda: (system, set_time_span(system, start, end, *breaks))
-    )[1]
+    key = id(system), *span
+    return _limited_systems.get_or_compute(key, lambda: (system, set_time_span(system, *span)))[1]
 
 
-def limit_family_to_span(family: Family, system: System, start: float, end: float, *breaks: float) -> Family:
-    """Return the family with each member limited to a span; ``system`` is one of the members."""
-    return family.map_members_with_numbers(set_time_span, start, end, *breaks) if is_driven_run(system) else family
+def limit_family_to_span(family: Family, system: System, schedule: StepSchedule) -> Family:
+    """Return the family with each member limited to the span of a schedule; ``system`` is one of the members."""
+    span = schedule.start, schedule.end, *schedule.breaks
+    return family.map_members_with_numbers(set_time_span, *span) if is_driven_run(system) else family
 
 
 def is_driven_run(system: System) -> bool:

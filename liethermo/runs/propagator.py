@@ -16,7 +16,7 @@ from ..engines.select_engine import ENGINES
 from ..engines.status_codes import StatusCode
 from ..errors import ConvergenceError, FileError, InputError, NonFiniteError
 from ..functions.time_span import TIMES_OF_SMOOTH_FUNCTIONS, DeclaredTimes
-from ..integrators import DEFAULT_METHOD, OneStepMethod, Reference
+from ..integrators import OneStepMethod, Reference
 from ..results.ensemble import Ensemble
 from ..results.solution import Solution
 from ..systems import AttitudeSystem, System
@@ -26,8 +26,8 @@ from .adaptive import Adaptive
 from .ensemble import ensemble
 from .events import Until
 from .named_parameters import replace_parameters
-from .noise import DEFAULT_NOISE_METHOD, Fluctuations, check_noise
-from .preparation import check_choice, has_undecided_invariants, refuse_tracers
+from .noise import Fluctuations, check_noise
+from .preparation import check_choice, check_steps, checked_method, has_undecided_invariants, refuse_tracers
 from .problem import Problem
 from .progress import Progress
 from .run import Run
@@ -38,14 +38,6 @@ from .varied_parameters import VariedParameters
 CONVERGENCE_FAILURES = tuple(
     code.status_name for code in (StatusCode.NOT_CONVERGED, StatusCode.STEP_UNDERFLOW, StatusCode.STEP_LIMIT)
 )
-
-REFERENCE_STEPS = (
-    "Reference chooses its own steps and cannot be combined with Adaptive, save_at, until or dense. Use another method"
-)
-"""Message for options that need steps of the library's own methods."""
-
-NOISY_STEPS = "noise= needs fixed steps and cannot be combined with Adaptive, until or dense. Give the step as a number"
-"""Message for options that a run with noise does not have."""
 
 FinalStateFunction: TypeAlias = Callable[[Any], np.ndarray | None]
 """A function from an initial state to the last state; its result is None where a run has to compute that."""
@@ -111,19 +103,13 @@ class Propagator:
     ):
         if noise is not None:
             check_noise(noise)
-        if method is None:
-            method = DEFAULT_METHOD if noise is None else DEFAULT_NOISE_METHOD
-        if not isinstance(method, OneStepMethod | Reference):
-            raise InputError(f"method must be an integrator such as lt.MetriplecticGauss(), got {method!r}")
+        method = checked_method(method, noise, runs_alone=True)
         if not isinstance(system, System):
             raise InputError(
                 f"the first argument must be a system such as lt.LiePoissonSystem, got {type(system).__name__}"
             )
         check_choice("engine", engine, ENGINES)
-        if isinstance(step, Adaptive) and isinstance(method, Reference):
-            raise InputError(REFERENCE_STEPS)
-        if isinstance(step, Adaptive) and noise is not None:
-            raise InputError(NOISY_STEPS)
+        check_steps(method, step, noise)
         self.system, self.method, self.step, self.engine, self.noise = system, method, step, engine, noise
         self._variants: LRUCache[Propagator] = LRUCache(MAX_CACHED_PARAMETER_SETS)
         self._decided_problem: Problem | None = None
@@ -190,10 +176,7 @@ class Propagator:
         check_choice("on_failure", on_failure, ("raise", "return"))
         step, adaptive = self.step, isinstance(self.step, Adaptive)
         problem = self._problem(x0)
-        if isinstance(self.method, Reference) and (dense or save_at is not None or until is not None):
-            raise InputError(REFERENCE_STEPS)
-        if self.noise is not None and (dense or until is not None):
-            raise InputError(NOISY_STEPS)
+        check_steps(self.method, step, self.noise, until, dense, save_at)
         declared = self._declared_times if problem.is_driven else TIMES_OF_SMOOTH_FUNCTIONS
         allow_infinite_end = adaptive and until is not None
         schedule = self._schedule(t_span, save_every, save_at, allow_infinite_end, breaks, declared)
@@ -258,8 +241,6 @@ class Propagator:
         **options
             Other arguments of :func:`ensemble`, such as ``outputs="summary"``.
         """
-        if isinstance(self.method, Reference):
-            raise InputError("Reference runs single trajectories: call the propagator for each of them")
         if self.engine == "sparse":
             raise InputError('ensembles have no engine "sparse": leave out engine')
         return ensemble(

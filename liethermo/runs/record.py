@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,8 @@ from ..engines.compiled.parameters import ProgramStructure
 from ..engines.select_engine import EngineWithFallback
 from ..engines.status_codes import StatusCode
 from ..engines.step import energy_or_entropy_that_relaxes
-from ..integrators import OneStepMethod
+from ..engines.step_control import StepControl
+from ..integrators.fluctuating import noise_dimension
 from ..results.audit_evidence import (
     MAX_LOCAL_ERROR_STEPS,
     MAX_SENSITIVITY_STATES,
@@ -27,20 +28,26 @@ from ..results.audit_evidence import (
     evenly_spaced_indices,
     largest_and_evenly_spaced,
     largest_drifts,
+    merge_evidence,
     n_replayed_steps,
     rounding_scales,
     select_worst_steps,
 )
 from ..results.ensemble import Ensemble
+from ..results.events import Events
 from ..results.rounding_scale import InvariantDrift, RoundingScale
 from ..results.solution import Solution
+from ..results.status import Laws
 from ..results.step_sampling import MAX_SAMPLED_VALUES, REPLAY_COST_RATIO, StepSample
 from ..systems import AttitudeSystem, System
 from ..systems.attitude import driven_system_or_none
 from ..systems.conditions import RunCondition, worst_conditions
 from ..systems.states import reshape_to_sites
 from ..tracing.interpret import evaluate_at_points
+from .events import EventSet, collect_events
+from .noise import NoisePaths
 from .preparation import invariants_and_laws
+from .problem import Problem
 from .schedule import StepSchedule
 from .solution_builder import (
     EngineReplay,
@@ -63,6 +70,9 @@ RECORDED_QUANTITIES = (
 FAILURE_CODES = (StatusCode.NOT_CONVERGED, StatusCode.NON_FINITE, StatusCode.STEP_UNDERFLOW, StatusCode.STEP_LIMIT)
 """Status codes of failed trajectories."""
 
+MAX_REPLAYED_STEPS = 256
+"""Largest number of steps of a trajectory that an audit replays on the array engine, whose steps are slow."""
+
 MAX_EXPLAINED_FAILURES = 1_000
 """Largest number of failed trajectories that are checked for unbounded growth."""
 
@@ -70,154 +80,98 @@ MemberSelection = slice | np.ndarray
 """Indices of trajectories in a record."""
 
 
-class EnsembleRecord:
-    """Outcomes and saved states of all trajectories of an ensemble run, filled in batch by batch.
+class TrajectoryGroup(NamedTuple):
+    """Trajectories of an ensemble that one program runs, as they are run.
 
-    Parameters
+    Attributes
     ----------
+    numbers : array of int, shape (B,)
+        Numbers of the trajectories in the ensemble, increasing.
+    problem : Problem
+        The problem of one of them, whose method and laws belong to all.
     family : Family
-        The systems as they are run.
+        Their systems.
     member : System
         One member of the family.
     x0 : array, shape (B, n)
+        Initial states.
     schedule : StepSchedule
-    outputs : {"final", "trajectory", "summary"}
     h : float
         Step size; NaN for adaptive steps.
+    control : StepControl or None
+        The control of adaptive steps, and of steps of a given size with events.
+    events : EventSet or None
+        The events whose functions the control has.
+    noise : NoisePaths or None
     """
 
-    def __init__(self, family: Family, member: System, x0: np.ndarray, schedule: StepSchedule, outputs: str, h: float):
-        self.h = h
-        self.family, self.member, self.x0, self.schedule = family, member, x0, schedule
-        self.saved_times, self.saved_step_counts, self.n_steps = (
-            schedule.saved_times,
-            schedule.saved_step_counts,
-            schedule.n_steps,
-        )
-        n_members = len(x0)
-        self.quantities: dict[str, np.ndarray] = {name: np.empty(n_members) for name in RECORDED_QUANTITIES}
-        self.is_finished = np.zeros(n_members, dtype=bool)
-        self.status = np.full(n_members, StatusCode.INTERRUPTED, dtype=np.int8)
-        self.steps, self.iterations, self.rejected = (np.zeros(n_members, dtype=np.int64) for _ in range(3))
-        self.quantities["first_step"][:] = schedule.longest_steps[0]
-        self.quantities["end_time"][:] = schedule.start
-        self.x = np.empty((n_members, member.dim)) if outputs == "final" else None
+    numbers: np.ndarray
+    problem: Problem
+    family: Family
+    member: System
+    x0: np.ndarray
+    schedule: StepSchedule
+    h: float
+    control: StepControl | None
+    events: EventSet | None
+    noise: NoisePaths | None
+
+
+class EnsembleRecord:
+    """Outcomes and saved states of all trajectories of an ensemble, filled in group by group.
+
+    Arrays have the trajectories first. Those of trajectories in no group are NaN, and their status is inadmissible.
+
+    Parameters
+    ----------
+    groups : sequence of TrajectoryGroup
+        At least one.
+    n_trajectories : int
+        Number of trajectories of the ensemble.
+    outputs : {"final", "trajectory", "summary"}
+
+    Attributes
+    ----------
+    groups : list of GroupRecord
+        The parts of the record that the runs of the groups fill.
+    """
+
+    def __init__(self, groups: Sequence[TrajectoryGroup], n_trajectories: int, outputs: str):
+        first_group = groups[0]
+        self.member, self.saved_times = first_group.member, first_group.schedule.saved_times
+        self.start, dim = first_group.schedule.start, self.member.dim
+        self.quantities = {name: np.full(n_trajectories, np.nan) for name in RECORDED_QUANTITIES}
+        self.status = np.full(n_trajectories, StatusCode.INADMISSIBLE, dtype=np.int8)
+        self.steps, self.iterations, self.rejected = (np.zeros(n_trajectories, dtype=np.int64) for _ in range(3))
+        self.x = np.full((n_trajectories, dim), np.nan) if outputs == "final" else None
         self.trajectories = (
-            np.full((n_members, len(self.saved_times), member.dim + 2), np.nan) if outputs == "trajectory" else None
+            np.full((n_trajectories, len(self.saved_times), dim + 2), np.nan) if outputs == "trajectory" else None
         )
-        self.work = np.empty(n_members)
+        self.driven = driven_system_or_none(self.member)
+        self.work = None if self.driven is None else np.full(n_trajectories, np.nan)
+        self.x0 = first_group.x0
+        if len(self.x0) < n_trajectories:
+            self.x0 = np.full((n_trajectories, dim), np.nan)
+            for group in groups:
+                self.x0[group.numbers] = group.x0
         self.failure_reasons: dict[int, str] = {}
-        self.events: list[EventOccurrence] = []  # with the indices of trajectories in this record
+        self.events: list[EventOccurrence] = []
+        self.groups = [GroupRecord(self, group) for group in groups]
 
-    def record_initial(self, members: MemberSelection, x: np.ndarray, energy: np.ndarray, entropy: np.ndarray) -> None:
-        """Store the initial states with energy and entropy, if trajectories are saved."""
-        if self.trajectories is not None:
-            self.trajectories[members, 0] = np.column_stack([x, energy, entropy])
-
-    def store_states(self, members: MemberSelection, first_save: int, states: np.ndarray) -> None:
-        """Store states from save number ``first_save`` on, with energy and entropy, shape (members, saves, n + 2)."""
-        if self.trajectories is not None:
-            self.trajectories[members, first_save : first_save + states.shape[1]] = states
-
-    def store_states_at(self, members: np.ndarray, t: np.ndarray, states: np.ndarray) -> None:
-        """Store states with energy and entropy, shape (members, n + 2), each at its saved time t."""
-        if self.trajectories is not None:
-            self.trajectories[members, np.searchsorted(self.saved_times, t)] = states
-
-    def store_events(self, occurrences: Sequence[EventOccurrence], members: np.ndarray) -> None:
-        """Store events of trajectories whose indices in this record are ``members[trajectory]``."""
-        for event in occurrences:
-            member = int(members[event.trajectory])
-            if event.trajectory == 0 or members[event.trajectory - 1] != member:  # no copy that fills a padded batch
-                self.events.append(event._replace(trajectory=member))
-
-    def finish_fixed_step_members(
-        self, members: MemberSelection, initial: Mapping[str, np.ndarray], final: Mapping[str, np.ndarray]
-    ) -> None:
-        """Record the outcome of trajectories with fixed steps, from their first and last engine states.
+    def to_ensemble(
+        self, replay: Callable, reasons: Mapping[int, str], provenance: Mapping[str, Any], **fields: Any
+    ) -> Ensemble:
+        """Return the recorded trajectories as an :class:`Ensemble`, with further fields of it.
 
         Parameters
         ----------
-        initial, final : mapping of arrays
-            Fields of :class:`liethermo.engines.step.State`.
+        replay : function of (engine, family, method, x, h, steps)
+            As :func:`.ensemble_lanes.replay_steps`.
+        reasons : mapping from int to str
+            Why trajectories are inadmissible.
+        provenance : mapping
+            Without the engine.
         """
-        steps = final["step"].astype(np.int64)
-        status = np.where((final["status"] == 0) & (steps < self.n_steps), StatusCode.INTERRUPTED, final["status"])
-        self.finish_members(members, initial, final, status, self.schedule.times_after(steps))
-        if self.trajectories is not None:
-            is_after_end = (
-                np.arange(len(self.saved_step_counts))
-                >= np.searchsorted(self.saved_step_counts, steps, side="right")[:, None]
-            )
-            self.trajectories[members] = np.where(is_after_end[..., None], np.nan, self.trajectories[members])
-
-    @np.errstate(over="ignore", invalid="ignore")  # overflowed states have the status non_finite
-    def finish_members(
-        self, members: MemberSelection, initial: Mapping, final: Mapping, status: np.ndarray, end_time: np.ndarray
-    ) -> None:
-        """Record the outcome of trajectories: status, end time, final state and the quantities of the audit."""
-        quantities, energy, initial_energy = self.quantities, final["energy"], initial["energy"]
-        self.is_finished[members] = True
-        quantities["energy"][members], quantities["entropy"][members] = energy, final["entropy"]
-        drift = np.maximum(final["largest_energy"] - initial_energy, initial_energy - final["smallest_energy"])
-        quantities["energy_drift"][members] = drift / RoundingScale(initial_energy, final["energy_sensitivity"]).scale
-        for name in ("energy_sensitivity", "entropy_sensitivity", "first_energy", "smallest_energy", "largest_energy"):
-            quantities[name][members] = final[name]
-        quantities["entropy_change"][members] = final["entropy"] - initial["entropy"]
-        quantities["distance"][members] = np.abs(final["x"] - initial["x"]).max(axis=1)
-        quantities["largest_energy_increment"][members] = final["largest_energy_increment"]
-        quantities["least_entropy_increment"][members] = final["least_entropy_increment"]
-        quantities["entropy_scale"][members] = np.maximum(np.abs(initial["entropy"]), np.abs(final["entropy"]))
-        quantities["residual"][members] = final["residual"]
-        quantities["end_time"][members] = end_time
-        start, end = (
-            np.asarray(energy_or_entropy_that_relaxes(self.member, f["energy"], f["entropy"])) for f in (initial, final)
-        )
-        change = np.where(np.abs(end - start) > 1e-12 * np.abs(end), end - start, np.nan)
-        quantities["relaxation_time"][members] = (
-            end * (end_time - self.schedule.start) - final["relaxation_integral"]
-        ) / change
-        self.status[members], self.steps[members] = status, final["step"]
-        self.iterations[members] = final["fixed_point_iterations"] + final["newton_iterations"]
-        self._explain_failures(members, final["x"], status, end_time)
-        if self.x is not None:
-            self.x[members] = final["x"]
-        if (driven := driven_system_or_none(self.member)) is not None:
-            self.work[members] = driven.work(final["x"][..., : driven.dim])
-
-    def _explain_failures(
-        self, members: MemberSelection, x: np.ndarray, status: np.ndarray, end_time: np.ndarray
-    ) -> None:
-        """Store failure messages of trajectories that grow without bound, for the first failures at least."""
-        status, end_time = (np.broadcast_to(a, len(x)) for a in (status, end_time))
-        failed_rows = np.flatnonzero(np.isin(status, FAILURE_CODES))[
-            : max(0, MAX_EXPLAINED_FAILURES - len(self.failure_reasons))
-        ]
-        if not len(failed_rows):
-            return
-        member_indices = np.arange(len(self.x0))[members][failed_rows]
-        parameters = self.family.select(member_indices).parameter_matrix(slice(None), len(member_indices))
-        velocities = _vector_fields(
-            (self.family.form, parameters.shape[1]), np.concatenate([parameters, x[failed_rows]], axis=1)
-        )
-        for i, j, velocity in zip(failed_rows, member_indices, velocities, strict=True):
-            t = float(end_time[i])
-            if text := ensemble_failure_message(x[i], self.x0[j], velocity, t - self.schedule.start, t, self.h):
-                self.failure_reasons[int(j)] = text
-
-    def set_unfinished_to_nan(self) -> None:
-        """Set the quantities of unfinished trajectories to NaN."""
-        if not self.is_finished.all():
-            outcome_arrays = [
-                values for name, values in self.quantities.items() if name not in ("first_step", "end_time")
-            ]
-            for values in [*outcome_arrays, self.work, *([] if self.x is None else [self.x])]:
-                values[~self.is_finished] = np.nan
-
-    # -- the result ---------------------------------------------------------------------------------------------------
-
-    def to_ensemble(self, **fields: Any) -> Ensemble:
-        """Return the recorded trajectories as an :class:`Ensemble`, with further fields of it."""
         quantities: dict[str, Any] = {
             n: values for n, values in self.quantities.items() if n not in ("distance", "first_step")
         }
@@ -229,14 +183,16 @@ class EnsembleRecord:
                 self.trajectories[..., -1],
                 self.saved_times,
             )
-        x0, attitude, attitude0, work = self.x0, None, None, None
+        x0, attitude, attitude0, work = self.x0, None, None, self.work
         if isinstance(self.member, AttitudeSystem):
             x0, attitude0 = map(np.asarray, self.member.split_state(x0))
             if x is not None:
                 x, attitude = map(np.asarray, self.member.split_state(x))
-        if (driven := driven_system_or_none(self.member)) is not None:
-            work = self.work if self.trajectories is None else np.asarray(driven.work(x))
+        if self.driven is not None:
+            if self.trajectories is not None:
+                work = np.asarray(self.driven.work(x))
             x, x0, energy = None if x is None else x[..., :-2], x0[..., :-2], energy + work
+        engine, events = " and ".join(sorted({group.engine for group in self.groups} - {""})), self.groups[0].events
         result = Ensemble(
             t=t,
             x=x,
@@ -250,45 +206,220 @@ class EnsembleRecord:
             attitude=attitude,
             attitude0=attitude0,
             work=work,
+            laws=common_laws([group.problem.laws for group in self.groups]),
+            engine=engine,
+            events=Events() if events is None else collect_events(self.member, events.names, self.events),
+            reasons={**reasons, **self.failure_reasons},
+            provenance={**provenance, "engine": engine},
+            evidence_source=self._evidence_source(replay),
             velocity_sources=self._velocity_sources(),
+            solution_builder=self._build_solution,
             **quantities,
             **fields,
         )
         return reshape_to_sites(self.member, result)
 
+    def _evidence_source(self, replay: Callable) -> Callable[[], Evidence] | None:
+        """Return the function that computes the evidence for an audit, or None: short steps with noise show only it."""
+        if noise_dimension(self.groups[0].method):
+            return None
+        collectors = [
+            EnsembleEvidenceCollector(group, functools.partial(replay, group.engine)) for group in self.groups
+        ]
+        return lambda: merge_evidence([collect() for collect in collectors])
+
     def _velocity_sources(self) -> dict[str, Callable[[], np.ndarray]]:
         """Return the functions that compute the velocities, trajectories first, by their names."""
-        x = self.x if self.trajectories is None else self.trajectories[..., :-2]
-        if x is None:
+        if self.x is None and self.trajectories is None:
             return {}
-        return {name: functools.partial(self._velocities, name, x) for name in velocity_names(self.member)}
+        return {name: functools.partial(self._velocities, name) for name in velocity_names(self.member)}
 
-    def _velocities(self, name: str, x: np.ndarray) -> np.ndarray:
-        if not any(self.family.has_member_axis):
-            return velocities_at_states(name, self.member, x)
-        return np.stack([velocities_at_states(name, self.family.member(i), states) for i, states in enumerate(x)])
+    def _velocities(self, name: str) -> np.ndarray:
+        parts = [group.velocities(name) for group in self.groups]
+        values = np.full((len(self.status), *parts[0].shape[1:]), np.nan)
+        for group, part in zip(self.groups, parts, strict=True):
+            values[group.numbers] = part
+        return values
+
+    def _build_solution(self, ensemble: Ensemble, i: int) -> Solution:
+        """Return the solution of a trajectory, as a single run would present it."""
+        group = next(group for group in self.groups if i in group.numbers)
+        return group.build_solution(ensemble.member_solution(i), int(np.searchsorted(group.numbers, i)))
 
 
-class MemberSolutionBuilder:
-    """Builds the :class:`Solution` of one trajectory of an ensemble, as a single run would present it."""
+class GroupRecord:
+    """The part of the record of an ensemble that belongs to a group of trajectories, which the run of the group fills.
 
-    def __init__(self, record: EnsembleRecord, method: OneStepMethod, trajectory_numbers: np.ndarray):
-        self.record, self.method, self.trajectory_numbers = record, method, trajectory_numbers
+    Trajectories are selected by their indices in the group.
 
-    def __call__(self, ensemble: Ensemble, i: int) -> Solution:
-        record, j, member_solution = (
-            self.record,
-            int(np.searchsorted(self.trajectory_numbers, i)),
-            ensemble.member_solution(i),
+    Parameters
+    ----------
+    record : EnsembleRecord
+    group : TrajectoryGroup
+
+    Attributes
+    ----------
+    engine : str
+        The engine that has run the group.
+    """
+
+    def __init__(self, record: EnsembleRecord, group: TrajectoryGroup):
+        self.numbers, self.problem, self.family, self.member, self.x0, self.schedule, self.h = group[:7]
+        self.method = self.problem.method
+        self.control, self.events, self.noise = group[7:]
+        self.record, self.engine = record, ""
+        self._is_all = len(self.numbers) == len(record.status)
+        rows = self._rows(slice(None))
+        record.status[rows] = StatusCode.INTERRUPTED
+        record.quantities["first_step"][rows] = self.schedule.longest_steps[0]
+        record.quantities["end_time"][rows] = self.schedule.start
+
+    def _rows(self, members: MemberSelection) -> MemberSelection:
+        """Return the rows of the record for the trajectories with these indices in the group."""
+        return members if self._is_all else self.numbers[members]
+
+    @property
+    def is_interrupted(self) -> bool:
+        """True if the run of the group was interrupted: a trajectory has not reached its end, and has not failed."""
+        return bool((self.record.status[self._rows(slice(None))] == StatusCode.INTERRUPTED).any())
+
+    def quantity(self, name: str, members: np.ndarray) -> np.ndarray:
+        """Return the recorded values of a quantity for trajectories of the group."""
+        return self.record.quantities[name][self._rows(members)]
+
+    def store_first_steps(self, members: np.ndarray, sizes: np.ndarray) -> None:
+        """Store the sizes of the first steps of trajectories."""
+        self.record.quantities["first_step"][self._rows(members)] = sizes
+
+    def record_initial(self, members: MemberSelection, x: np.ndarray, energy: np.ndarray, entropy: np.ndarray) -> None:
+        """Store the initial states with energy and entropy, if trajectories are saved."""
+        if self.record.trajectories is not None:
+            self.record.trajectories[self._rows(members), 0] = np.column_stack([x, energy, entropy])
+
+    def store_states(self, members: MemberSelection, first_save: int, states: np.ndarray) -> None:
+        """Store states from save number ``first_save`` on, with energy and entropy, shape (members, saves, n + 2)."""
+        if self.record.trajectories is not None:
+            saves = slice(first_save, first_save + states.shape[1])
+            self.record.trajectories[self._rows(members), saves] = states
+
+    def store_states_at(self, members: np.ndarray, t: np.ndarray, states: np.ndarray) -> None:
+        """Store states with energy and entropy, shape (members, n + 2), each at its saved time t."""
+        if self.record.trajectories is not None:
+            self.record.trajectories[self._rows(members), np.searchsorted(self.record.saved_times, t)] = states
+
+    def store_events(self, occurrences: Sequence[EventOccurrence], members: np.ndarray) -> None:
+        """Store events of trajectories whose indices in the group are ``members[trajectory]``."""
+        for event in occurrences:
+            member = int(members[event.trajectory])
+            if event.trajectory == 0 or members[event.trajectory - 1] != member:  # no copy that fills a padded batch
+                self.record.events.append(event._replace(trajectory=int(self.numbers[member])))
+
+    def finish_fixed_step_members(
+        self, members: MemberSelection, initial: Mapping[str, np.ndarray], final: Mapping[str, np.ndarray]
+    ) -> None:
+        """Record the outcome of trajectories with fixed steps, from their first and last engine states.
+
+        Parameters
+        ----------
+        initial, final : mapping of arrays
+            Fields of :class:`liethermo.engines.step.State`.
+        """
+        steps = final["step"].astype(np.int64)
+        is_unfinished = (final["status"] == StatusCode.COMPLETED) & (steps < self.schedule.n_steps)
+        status = np.where(is_unfinished, StatusCode.INTERRUPTED, final["status"])
+        self.finish_members(members, initial, final, status, self.schedule.times_after(steps))
+        if self.record.trajectories is not None:
+            counts, rows = self.schedule.saved_step_counts, self._rows(members)
+            is_after_end = np.arange(len(counts)) >= np.searchsorted(counts, steps, side="right")[:, None]
+            trajectories = self.record.trajectories
+            trajectories[rows] = np.where(is_after_end[..., None], np.nan, trajectories[rows])
+
+    @np.errstate(over="ignore", invalid="ignore")  # overflowed states have the status non_finite
+    def finish_members(
+        self,
+        members: MemberSelection,
+        initial: Mapping,
+        final: Mapping,
+        status: np.ndarray,
+        end_time: np.ndarray,
+        n_rejected: np.ndarray | None = None,
+    ) -> None:
+        """Record the outcome of trajectories: status, end time, final state and the quantities of the audit."""
+        record, rows = self.record, self._rows(members)
+        quantities, energy, initial_energy = record.quantities, final["energy"], initial["energy"]
+        quantities["energy"][rows], quantities["entropy"][rows] = energy, final["entropy"]
+        drift = np.maximum(final["largest_energy"] - initial_energy, initial_energy - final["smallest_energy"])
+        quantities["energy_drift"][rows] = drift / RoundingScale(initial_energy, final["energy_sensitivity"]).scale
+        for name in ("energy_sensitivity", "entropy_sensitivity", "first_energy", "smallest_energy", "largest_energy"):
+            quantities[name][rows] = final[name]
+        quantities["entropy_change"][rows] = final["entropy"] - initial["entropy"]
+        quantities["distance"][rows] = np.abs(final["x"] - initial["x"]).max(axis=1)
+        quantities["largest_energy_increment"][rows] = final["largest_energy_increment"]
+        quantities["least_entropy_increment"][rows] = final["least_entropy_increment"]
+        quantities["entropy_scale"][rows] = np.maximum(np.abs(initial["entropy"]), np.abs(final["entropy"]))
+        quantities["residual"][rows] = final["residual"]
+        quantities["end_time"][rows] = end_time
+        start, end = (
+            np.asarray(energy_or_entropy_that_relaxes(self.member, f["energy"], f["entropy"])) for f in (initial, final)
         )
-        system = record.family.member(j)
+        change = np.where(np.abs(end - start) > 1e-12 * np.abs(end), end - start, np.nan)
+        quantities["relaxation_time"][rows] = (
+            end * (end_time - self.schedule.start) - final["relaxation_integral"]
+        ) / change
+        record.status[rows], record.steps[rows] = status, final["step"]
+        record.iterations[rows] = final["fixed_point_iterations"] + final["newton_iterations"]
+        if n_rejected is not None:
+            record.rejected[rows] = n_rejected
+        self._explain_failures(members, final["x"], status, end_time)
+        if record.x is not None:
+            record.x[rows] = final["x"]
+        if record.driven is not None and record.work is not None:
+            record.work[rows] = record.driven.work(final["x"][..., : record.driven.dim])
+
+    def _explain_failures(
+        self, members: MemberSelection, x: np.ndarray, status: np.ndarray, end_time: np.ndarray
+    ) -> None:
+        """Store failure messages of trajectories that grow without bound, for the first failures at least."""
+        status, end_time = (np.broadcast_to(a, len(x)) for a in (status, end_time))
+        failed_rows = np.flatnonzero(np.isin(status, FAILURE_CODES))[
+            : max(0, MAX_EXPLAINED_FAILURES - len(self.record.failure_reasons))
+        ]
+        if not len(failed_rows):
+            return
+        member_indices = np.arange(len(self.x0))[members][failed_rows]
+        parameters = self.family.select(member_indices).parameter_matrix(slice(None), len(member_indices))
+        velocities = _vector_fields(
+            (self.family.form, parameters.shape[1]), np.concatenate([parameters, x[failed_rows]], axis=1)
+        )
+        for i, j, velocity in zip(failed_rows, member_indices, velocities, strict=True):
+            t = float(end_time[i])
+            if text := ensemble_failure_message(x[i], self.x0[j], velocity, t - self.schedule.start, t, self.h):
+                self.record.failure_reasons[int(self.numbers[j])] = text
+
+    def velocities(self, name: str) -> np.ndarray:
+        """Return the velocities of a name at the recorded states of the group, trajectories first."""
+        rows, x, trajectories = self._rows(slice(None)), self.record.x, self.record.trajectories
+        if trajectories is None:
+            assert x is not None
+            states = x[rows]
+        else:
+            states = trajectories[rows, ..., :-2]
+        if not any(self.family.has_member_axis):
+            return velocities_at_states(name, self.member, states)
+        return np.stack([velocities_at_states(name, self.family.member(i), x) for i, x in enumerate(states)])
+
+    def build_solution(self, member_solution: Solution, j: int) -> Solution:
+        """Return the solution of trajectory j of the group, as a single run would present it.
+
+        ``member_solution`` is the one that the ensemble has, without conserved functions.
+        """
+        system, row, record = self.family.member(j), int(self.numbers[j]), self.record
         if record.trajectories is None:
             assert record.x is not None
-            x = np.stack([record.x0[j], record.x[j]])
+            x = np.stack([self.x0[j], record.x[row]])
         else:
-            x = record.trajectories[j, : len(member_solution.t), :-2]
-        steps = np.minimum(np.diff(member_solution.t), record.quantities["first_step"][j])
-        energy = member_solution.energy_balance
+            x = record.trajectories[row, : len(member_solution.t), :-2]
+        steps = np.minimum(np.diff(member_solution.t), record.quantities["first_step"][row])
         invariants, laws = invariants_and_laws(system, self.method)
         solution = build_solution(
             system,
@@ -297,7 +428,7 @@ class MemberSolutionBuilder:
             laws=laws,
             functions=RecordedFunctions.from_system(system, invariants),
             t=member_solution.t,
-            energy=energy,
+            energy=member_solution.energy_balance,
             entropy=member_solution.entropy,
             step_sizes=lambda: steps,
             replay=EngineReplay(EngineWithFallback(system, self.method, "auto", 1)),
@@ -319,20 +450,23 @@ class EnsembleEvidenceCollector:
 
     Parameters
     ----------
+    group : GroupRecord
     replay : function of (family, method, x, h, steps)
         :func:`.ensemble_lanes.replay_steps` on an engine.
-    n_equal_steps : int
-        Number of equal steps at the start of the run.
     """
 
-    def __init__(self, record: EnsembleRecord, method: OneStepMethod, replay: Callable, n_equal_steps: int):
-        effort = record.iterations / np.fmax(record.steps, 1)
+    def __init__(self, group: GroupRecord, replay: Callable):
+        schedule, n_steps = group.schedule, group.record.steps[group.numbers]
+        effort = group.record.iterations[group.numbers] / np.fmax(n_steps, 1)
         sample = largest_and_evenly_spaced(effort, MAX_LOCAL_ERROR_STEPS)
-        self.family, self.member, self.method = record.family.select(sample), record.member, method
-        self.x, self.distance = np.ascontiguousarray(record.x0[sample]), record.quantities["distance"][sample]
-        self.h, self.start_time, self.replay = record.quantities["first_step"][sample], record.schedule.start, replay
-        self.n_steps_taken = record.steps[sample]
-        self.saved_states, self.saved_times = _sampled_saved_states(record, sample)
+        self.family, self.member, self.method = group.family.select(sample), group.member, group.method
+        self.x, self.distance = np.ascontiguousarray(group.x0[sample]), group.quantity("distance", sample)
+        self.h, self.start_time, self.replay = group.quantity("first_step", sample), schedule.start, replay
+        self.n_steps_taken = n_steps[sample]
+        self.saved_states, self.saved_times = _sampled_saved_states(group.record, group.numbers[sample])
+        n_equal_steps = 1 if np.isnan(group.h) else schedule.segments[0].n_full_steps
+        if group.engine != "compiled":
+            n_equal_steps = min(n_equal_steps, MAX_REPLAYED_STEPS)
         self.max_replayed_steps = max(1, min(n_equal_steps, MAX_SAMPLED_VALUES // (REPLAY_COST_RATIO * self.x.size)))
 
     @np.errstate(over="ignore", invalid="ignore")  # overflowed states have the status non_finite
@@ -433,7 +567,7 @@ class EnsembleEvidenceCollector:
 def _sampled_saved_states(
     record: EnsembleRecord, sample: np.ndarray
 ) -> tuple[Sequence[np.ndarray] | np.ndarray, np.ndarray]:
-    """Return saved states of some trajectories, shape (sample, times, n), and times that are spread over the run.
+    """Return saved states of trajectories with these numbers, shape (sample, times, n), and times spread over the run.
 
     Both are empty if the run keeps no states.
     """
@@ -442,9 +576,23 @@ def _sampled_saved_states(
             return (), np.zeros(0)
         states = np.stack([record.x0[sample], record.x[sample]], axis=1)
         end = np.nanmax(record.quantities["end_time"])
-        return states, np.linspace(record.schedule.start, end, MAX_SENSITIVITY_STATES)
+        return states, np.linspace(record.start, end, MAX_SENSITIVITY_STATES)
     times = evenly_spaced_indices(record.trajectories.shape[1], MAX_SENSITIVITY_STATES)
     return record.trajectories[sample][:, times, :-2], record.saved_times[times]
+
+
+def common_laws(laws_of_groups: Sequence[Laws]) -> Laws:
+    """Return the laws that hold for all groups: a function is conserved or not promised only if each group has it."""
+    first = laws_of_groups[0]
+    promised = set.intersection(*(set(laws.conserved) for laws in laws_of_groups))
+    constants = set.intersection(*({*laws.conserved, *laws.unpromised} for laws in laws_of_groups))
+    names = [name for name in (*first.conserved, *first.unpromised) if name in constants]
+    return replace(
+        first,
+        conserved=tuple(name for name in names if name in promised),
+        unpromised=tuple(name for name in names if name not in promised),
+        unknown=tuple(dict.fromkeys(name for laws in laws_of_groups for name in laws.unknown)),
+    )
 
 
 def _rounding_scales_at(model: tuple[ProgramStructure, int], row):

@@ -11,10 +11,9 @@ import numpy as np
 
 from ..engines.status_codes import RESULT_CODES, StatusCode
 from ..integrators import OneStepMethod
-from ..results.audit import Tolerances
+from ..results.audit import Tolerances, check_laws
 from ..results.audit_evidence import energy_and_entropy, rounding_scales
 from ..results.ensemble import Ensemble
-from ..results.ensemble_laws import evaluate_ensemble_laws
 from ..results.status import Laws
 from ..runs.ensemble import ensemble
 from ..runs.noise import Fluctuations
@@ -117,7 +116,7 @@ class PointResults:
 
 
 class LawSummary:
-    """Laws of some points, read from a store, in the form that :func:`.evaluate_ensemble_laws` expects."""
+    """Laws of some points, read from a store, in the form that :func:`.check_laws` expects."""
 
     def __init__(self, status: np.ndarray, laws: np.ndarray):
         self.ok = np.isin(status, (*SUCCESS_CODES, LAW_BROKEN, MEASURE_FAILED))
@@ -296,11 +295,12 @@ class PointSolver:
 
     def _broken_laws(self, result: Ensemble, law_values: Mapping[str, np.ndarray]) -> dict[int, str]:
         """Return a message for each successful trajectory that violates a law, by index."""
-        terms = law_values["energy_terms"], law_values["entropy_terms"]
+        terms = {name: law_values[f"{name}_terms"] for name in ("energy", "entropy")}
         violations: dict[int, str] = {}
-        for law in evaluate_ensemble_laws(result, result.laws, Tolerances(), *terms):
-            for i in map(int, np.flatnonzero(law.is_violated & result.ok)):
-                violations.setdefault(i, f"{law.law} {law.values[i]:.3g}, allowed {law.limits[i]:.2g}")
+        for check in check_laws(result, result.laws, Tolerances(), terms, has_entropy=False):
+            for i in map(int, np.flatnonzero(check.is_violated & result.ok)):
+                row = check.audit_row(i)
+                violations.setdefault(i, f"{row.law} {row.value:.3g}, allowed {row.tolerance:.2g}")
         return violations
 
     def _rounding_scales_at_start(

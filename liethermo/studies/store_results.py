@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import FileError
-from ..results.audit import Audit, AuditRow, Tolerances
-from ..results.ensemble_laws import evaluate_ensemble_laws
+from ..results.audit import Audit, AuditRow, Tolerances, check_laws
 from ..results.netcdf import dataclass_from_json
 from ..results.status import Laws
 from . import files
@@ -68,7 +66,7 @@ def audit_store(path: Any, **tolerances: float) -> Audit:
     accepted_tolerances = Tolerances.with_defaults(**tolerances)
     store = StudyStore.open(Path(path))
     axes, laws = store.read_axes(), dataclass_from_json(Laws, store.attributes["laws"])
-    worst_rows: dict[str, AuditRow] = {}
+    worst_rows: dict[str, tuple[float, AuditRow]] = {}
     min_entropy_increment, drift, residual = math.inf, 0.0, 0.0
     counts: dict[int, int] = {}
     for number, status in store.chunk_statuses():
@@ -85,15 +83,14 @@ def audit_store(path: Any, **tolerances: float) -> Audit:
         min_entropy_increment = min(
             min_entropy_increment, float(np.nanmin(summary.least_entropy_increment, initial=math.inf))
         )
-        for law in evaluate_ensemble_laws(
-            summary, laws, accepted_tolerances, summary.energy_terms, summary.entropy_terms
-        ):
-            i = law.worst_member
-            row = law.audit_row(i)
-            if law.law not in worst_rows or _excess_over_tolerance(row) > _excess_over_tolerance(worst_rows[law.law]):
+        terms = {"energy": summary.energy_terms, "entropy": summary.entropy_terms}
+        for check in check_laws(summary, laws, accepted_tolerances, terms, has_entropy=False):
+            i = int(np.argmax(check.excess))
+            if check.law not in worst_rows or check.excess[i] > worst_rows[check.law][0]:
                 point_index = tuple(int(p[np.flatnonzero(has_laws)[i]]) for p in store.point_indices(index))
-                worst_rows[law.law] = dataclasses.replace(row, note=f"worst at {axes.describe_point(point_index)}")
-    rows = list(worst_rows.values())
+                row = check.audit_row(i, f"worst at {axes.describe_point(point_index)}")
+                worst_rows[check.law] = float(check.excess[i]), row
+    rows = [row for _, row in worst_rows.values()]
     for name, code in STATUSES.items():
         if code not in (*SUCCESS_CODES, EMPTY_POINT_STATUS) and counts.get(code):
             rows.append(AuditRow(f"points with status {name}", float(counts[code]), 0.0, False))
@@ -107,8 +104,3 @@ def audit_store(path: Any, **tolerances: float) -> Audit:
         residual,
         tuple(rows),
     )
-
-
-def _excess_over_tolerance(row: AuditRow) -> float:
-    """Return by how much the value of a row exceeds its tolerance."""
-    return row.value - (row.tolerance or 0.0)

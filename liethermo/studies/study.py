@@ -16,12 +16,12 @@ from manifolds.errors import warn
 
 from ..engines.status_codes import StatusCode
 from ..errors import InputError
-from ..integrators import DEFAULT_METHOD, OneStepMethod
+from ..integrators import OneStepMethod
 from ..results.audit import Audit
 from ..runs.adaptive import Adaptive
 from ..runs.events import Relaxed
-from ..runs.noise import DEFAULT_NOISE_METHOD, Fluctuations, check_noise
-from ..runs.preparation import check_choice
+from ..runs.noise import Fluctuations, check_noise
+from ..runs.preparation import check_choice, checked_method
 from ..runs.schedule import make_schedule
 from ..systems import System
 from . import files, identity
@@ -139,9 +139,7 @@ class Study:
         if shared_names := axis_names & {*self._measures}:
             raise InputError(f"{shared_names.pop()!r} is a measure and an axis")
         check_noise(noise)
-        method = (DEFAULT_METHOD if noise is None else DEFAULT_NOISE_METHOD) if method is None else method
-        if not isinstance(method, OneStepMethod):
-            raise InputError(f"the method must be an integrator such as lt.MetriplecticGauss(), got {method!r}")
+        method = checked_method(method, noise)
         check_choice("engine", engine, ("auto", "array", "compiled"))
         if chunk is not None and (isinstance(chunk, bool) or not isinstance(chunk, int) or chunk < 1):
             raise InputError(f"chunk must be a positive integer, got {chunk!r}")

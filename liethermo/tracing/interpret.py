@@ -15,7 +15,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr
 
 from manifolds._arrays import is_traced
 
@@ -24,6 +23,7 @@ from .degrees import array_degree_bound
 from .index_check import check_indices
 from .programs import jit_unoptimised
 from .scalarize import UnsupportedPrimitive, scalarize
+from .searches import count_dense_operations
 from .traced import has_plain_functions, is_library_object, trace_callables
 
 MAX_INTERPRETED_INSTRUCTIONS = 30_000
@@ -105,35 +105,6 @@ def batch_evaluator(function: Callable, pytree: Any, dim: int) -> Callable[[np.n
         return jax.tree_util.tree_unflatten(structure, results)
 
     return evaluate
-
-
-DATA_MOVEMENT = frozenset(
-    "reshape broadcast_in_dim squeeze transpose slice dynamic_slice concatenate gather pad rev copy iota "
-    "convert_element_type".split()
-)
-"""Primitives without arithmetic."""
-
-
-def count_dense_operations(jaxpr) -> int:
-    """Return the number of scalar operations of a jaxpr; one pass of a loop of unknown length is counted."""
-    total = 0
-    for equation in jaxpr.eqns:
-        parameters = (value if isinstance(value, tuple | list) else [value] for value in equation.params.values())
-        inner_jaxprs = [
-            v.jaxpr if isinstance(v, ClosedJaxpr) else v
-            for values in parameters
-            for v in values
-            if isinstance(v, ClosedJaxpr | Jaxpr)
-        ]
-        if inner_jaxprs:
-            total += equation.params.get("length", 1) * sum(map(count_dense_operations, inner_jaxprs))
-        elif equation.primitive.name == "dot_general":
-            contracted_axes = equation.params["dimension_numbers"][0][0]
-            n_products = math.prod(equation.invars[0].aval.shape[axis] for axis in contracted_axes)
-            total += n_products * math.prod(equation.outvars[0].aval.shape)
-        elif equation.primitive.name not in DATA_MOVEMENT:
-            total += max(math.prod(v.aval.shape) for v in (*equation.invars, *equation.outvars))
-    return total
 
 
 def polynomial_degree_bound(function: Callable, pytree: Any, dim: int) -> float:

@@ -10,10 +10,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, DebugInfo, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, DebugInfo, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun, jaxprs_in_params
 
 from manifolds._content_keys import content_key
 from manifolds.matrices.exponential import expm
+
+from .searches import has_while_loop
 
 MAX_INLINE_NUMBERS = 64
 """Largest number of entries of an array that is recomputed from its origin; a larger one is stored as a table."""
@@ -165,7 +167,7 @@ class _LiftedBody:
             inputs = self._lift_literals(inputs)
         else:
             if not self.lifter.has_while_loop:
-                self.lifter.has_while_loop = any(_has_while_loop(p) for p in params.values())
+                self.lifter.has_while_loop = any(map(has_while_loop, jaxprs_in_params(params)))
             formula_index = _literal_input_index(name, inputs)
             inputs = [a if i == formula_index else self._lift_literals([a])[0] for i, a in enumerate(inputs)]
         return inputs, params
@@ -283,12 +285,3 @@ def _literal_input_index(name: str, inputs: list) -> int | None:
     index, factor = FORMULA_INPUTS.get(name, (0, 0.0))
     is_literal = factor and isinstance(inputs[index], Literal)
     return index if is_literal and float(factor * np.real(inputs[index].val)).is_integer() else None
-
-
-def _has_while_loop(parameter) -> bool:
-    """Return whether a parameter of an equation contains a ``while`` loop."""
-    if isinstance(parameter, ClosedJaxpr):
-        parameter = parameter.jaxpr
-    if isinstance(parameter, Jaxpr):
-        return any(e.primitive.name == "while" or any(map(_has_while_loop, e.params.values())) for e in parameter.eqns)
-    return isinstance(parameter, tuple | list) and any(map(_has_while_loop, parameter))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -13,7 +12,6 @@ from .builder import Builder, EnclosingScope, Scalar
 from .caching import LRUCache
 from .calls import MatrixProduct
 from .complex_numbers import flatten_scalars, scalar_kinds, unflatten_scalars
-from .primitives import MAX_UNROLLED_INPUT_PRODUCTS
 from .program import Program, Routine, live_instructions_and_new_names
 
 MIN_ROUTINE_PRODUCTS = 2
@@ -23,20 +21,6 @@ MIN_ROUTINE_INSTRUCTIONS = 500
 """Number of instructions above which a function becomes a routine."""
 
 _routine_cache: LRUCache[tuple] = LRUCache(256)
-
-
-def has_matrix_products(jaxpr) -> bool:
-    """Return whether a jaxpr contains a product of matrices that may become a loop."""
-    for eqn in jaxpr.eqns:
-        inner = eqn.params.get("jaxpr")
-        if (
-            eqn.primitive.name == "dot_general"
-            and max(math.prod(v.aval.shape) for v in eqn.invars) > MAX_UNROLLED_INPUT_PRODUCTS
-        ):
-            return True
-        if isinstance(inner, ClosedJaxpr) and has_matrix_products(inner.jaxpr):
-            return True
-    return False
 
 
 def call_routine_or_unroll(

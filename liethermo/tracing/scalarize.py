@@ -26,7 +26,8 @@ from .builder import Builder, EnclosingScope, LimitExceededError, Scalar, consta
 from .complex_numbers import ComplexBuilder, flatten_scalars, scalar_kinds, unflatten_scalars
 from .primitives import SUPPORTED_PARAMETERS, UNROLLING_RULES
 from .program import Program, ScanLoop, WhileLoop, live_instructions_and_new_names
-from .routines import MIN_ROUTINE_INSTRUCTIONS, call_routine_or_unroll, has_matrix_products
+from .routines import MIN_ROUTINE_INSTRUCTIONS, call_routine_or_unroll
+from .searches import has_matrix_products
 
 MAX_INSTRUCTIONS = 200_000
 """Largest number of instructions of a program: far more than compile in reasonable time."""

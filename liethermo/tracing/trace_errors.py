@@ -8,11 +8,12 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import Jaxpr, jaxprs_in_params
+from jax.extend.core import Jaxpr
 from jax.extend.core.primitives import convert_element_type_p
 
 from ..errors import FunctionError
 from .scalarize import is_user_file, user_source_line
+from .searches import iterate_equations
 
 TRACE_ERRORS = (TypeError, ValueError, IndexError, AttributeError)
 """Exceptions that a call with traced arrays may raise."""
@@ -83,9 +84,7 @@ def check_precision(jaxpr: Jaxpr, name: str) -> None:
 
     Steps conserve the laws to the rounding of double precision, so no step with such a function could be solved.
     """
-    for eqn in jaxpr.eqns:
-        for inner in jaxprs_in_params(eqn.params):
-            check_precision(inner, name)
+    for eqn, _ in iterate_equations(jaxpr):
         if eqn.primitive is convert_element_type_p:
             operand: Any = eqn.invars[0].aval
             dtype = np.dtype(eqn.params["new_dtype"])

@@ -103,9 +103,31 @@ def test_entropies_fall_by_the_rounding_of_what_they_are_computed_from(entropy):
     assert ensemble.audit().passed, f"\n{ensemble.audit()}"
     fall = np.full(64, 1e-11) + 16 * np.spacing(ensemble.entropy_scale)
     step_damage = dataclasses.replace(ensemble, least_entropy_increment=-fall)
-    assert only_row(step_damage.audit(), "relative fall").passed is False
+    assert only_row(step_damage.audit(), "least entropy increment").passed is False
     total_damage = dataclasses.replace(ensemble, entropy_change=-fall)
-    assert only_row(total_damage.audit(), "relative fall of the entropy in all").passed is False
+    assert only_row(total_damage.audit(), "least entropy increment").passed is False
+
+
+def test_the_worst_trajectory_of_a_row_is_one_that_has_run():
+    """A trajectory that could not start obeys every law by doing nothing; it hid the others in each row."""
+    body, x0s = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2), np.random.default_rng(0).standard_normal((4, 3))
+    x0s[0] = np.nan
+    ensemble = lt.ensemble(body, x0s, (0.0, 3.0), 0.1)
+    rows = [only_row(ensemble.audit(), law) for law in ("energy drift", "least entropy increment", "stage residual")]
+    worst = [int(row.note.removeprefix("worst is trajectory ")) for row in rows]
+    assert min(worst) > 0
+    assert all(row.tolerance != 0.0 for row in rows)
+    assert rows[1].value == ensemble.least_entropy_increment[worst[1]]
+
+
+def test_an_ensemble_of_one_has_the_laws_of_a_single_run():
+    body, x0 = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2), [0.1, 0.2, 1.0]
+    single = lt.integrate(body, x0, (0.0, 3.0), 0.1).audit()
+    many = lt.ensemble(body, [x0], (0.0, 3.0), 0.1, outputs="trajectory").audit()
+    for law in ("energy drift", "least entropy increment", "stage residual"):
+        row, other = only_row(single, law), only_row(many, law)
+        assert (row.value, row.passed) == (other.value, other.passed), law
+        assert row.tolerance == pytest.approx(other.tolerance, rel=1e-12), law
 
 
 def test_a_constant_does_not_hide_a_drift():

@@ -211,7 +211,7 @@ def test_what_cannot_be_compiled():
         ({"outputs": "all"}, "'final', 'trajectory' or 'summary'"),
         ({"engine": "fast"}, "'auto', 'array' or 'compiled'"),
         ({"step": 0.0}, "positive"),
-        ({"method": lt.Reference()}, "must be an integrator"),
+        ({"method": lt.Reference()}, "runs single trajectories"),
         ({"system": 3}, "a function that builds one"),
         ({"system": lt.models.rigid_body}, "needs parameters"),
         ({"parameters": {"rate": np.ones(2)}}, r"no parameter 'rate'; its parameters are .*dissipation\.rate"),
