@@ -161,7 +161,8 @@ LEARNING_MEASUREMENTS = ("learn_gas", "learn_pendulum", "learn_body")
 THEME_NOTES = {
     "The same scheme in C": "By their construction variational schemes 1 and 3 conserve the energy only "
     "approximately, in C as in this library. Calls of 1000 steps keep every state.",
-    "One trajectory at equal accuracy": "The error is relative, at t = 100.",
+    "One trajectory at equal accuracy": "The error is relative, at t = 100. The other programs are prepared once; a "
+    "run of this library is a call of `integrate`, which prepares it anew.",
     "Many trajectories at equal accuracy": "The error is the largest of 32 states at t = 10. The drifts of the other "
     "programs compare the first and the last state.",
     "Satellites": "Every run computes the attitude too. Error: the angular momentum in the body, relative to DOP853 "

@@ -36,13 +36,7 @@ def library_settings() -> Iterator[None]:
     PrecisionError
         If double precision has been switched off.
     """
-    config: Any = jax.config
-    if not config.jax_enable_x64:
-        raise PrecisionError(
-            "JAX must compute in double precision, but jax_enable_x64 was switched off after the import. "
-            'Switch it on again with jax.config.update("jax_enable_x64", True)'
-        )
-    user_values = (config.jax_numpy_rank_promotion, config.jax_numpy_dtype_promotion, config.jax_debug_infs)
+    user_values = _checked_settings()
     if user_values == LIBRARY_SETTINGS:
         yield
         return
@@ -52,6 +46,23 @@ def library_settings() -> Iterator[None]:
             yield
     finally:
         _saved_user_settings.reset(token)
+
+
+def _checked_settings() -> tuple[Any, ...]:
+    """Return the settings in force, in the order of LIBRARY_SETTINGS.
+
+    Raises
+    ------
+    PrecisionError
+        If double precision has been switched off.
+    """
+    config: Any = jax.config
+    if not config.jax_enable_x64:
+        raise PrecisionError(
+            "JAX must compute in double precision, but jax_enable_x64 was switched off after the import. "
+            'Switch it on again with jax.config.update("jax_enable_x64", True)'
+        )
+    return config.jax_numpy_rank_promotion, config.jax_numpy_dtype_promotion, config.jax_debug_infs
 
 
 @contextlib.contextmanager
@@ -74,6 +85,8 @@ def with_library_settings(function: F) -> F:
 
     @functools.wraps(function)
     def called(*args, **kwargs):
+        if _checked_settings() == LIBRARY_SETTINGS:  # the usual case, without the cost of a context manager
+            return function(*args, **kwargs)
         with library_settings():
             return function(*args, **kwargs)
 

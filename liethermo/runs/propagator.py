@@ -293,8 +293,9 @@ class Propagator:
         self, t_span, save_every: int, save_at, allow_infinite_end: bool, breaks, declared: DeclaredTimes
     ) -> StepSchedule:
         """Return the schedule of a run; short ones that were used last, by any propagator, are cached."""
-        kind, is_plain = type(self.step), save_at is None and not allow_infinite_end and not np.size(breaks)
-        if not is_plain or any(declared) or type(save_every) is not int or kind not in (float, int, Adaptive):
+        kind, has_breaks = type(self.step), any(declared) or not isinstance(breaks, tuple) or breaks
+        is_plain = save_at is None and not allow_infinite_end and not has_breaks and type(save_every) is int
+        if not is_plain or kind not in (float, int, Adaptive):
             return make_schedule(t_span, self.step, save_every, save_at, allow_infinite_end, breaks, declared)
         key = *checked_span(t_span), save_every, kind if kind is Adaptive else self.step
         schedule = _schedules.get(key)
