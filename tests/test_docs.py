@@ -87,7 +87,8 @@ def test_an_example_runs_and_draws(example, scratch):
 def test_the_reference_lists_every_public_name(package):
     pages = [page.read_text() for page in (ROOT / "docs/reference").glob("api_*.md")]
     listed_names = [name for page in pages for name in re.findall(r"^ {3}([\w.]+)$", page, re.MULTILINE)]
-    assert sorted(set(package.__all__) - {word for name in listed_names for word in name.split(".")}) == []
+    missing = set(package.__all__) - {word for name in listed_names for word in name.split(".")}
+    assert not missing, f"add to a page docs/reference/api_*.md: {sorted(missing)}"
 
 
 def test_the_page_of_errors_has_every_class_with_its_built_in():

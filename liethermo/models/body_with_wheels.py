@@ -14,10 +14,11 @@ import manifolds as mf
 from manifolds._pytree_module import Module
 
 from ..errors import InputError
-from ..systems import EulerPoincareClosedSystem
+from ..systems import EulerPoincareClosedSystem, LiePoissonSystem
 from ..systems.torque import MIN_ARGUMENTS, check_torque, evaluate_torque, torque_name
 from .inertia import checked_inertia
 from .parameters import checked_positive
+from .rotors import reaction_wheels
 
 
 class _Lagrangian(Module):
@@ -58,7 +59,8 @@ def body_with_wheels(
     heat: float = 2.0,
     temperature: float = 1.0,
     torque=None,
-) -> EulerPoincareClosedSystem:
+    attitude: bool = False,
+) -> EulerPoincareClosedSystem | LiePoissonSystem:
     """A body with three wheels, one about each body axis, whose bearing friction heats it.
 
     ``l = sum I_i Omega_i^2 / 2 + sum J_i (Omega_i + w_i)^2 / 2 - C T_0 exp(S / C)`` on so(3) + R^3, ``f = -k w`` on the
@@ -77,25 +79,40 @@ def body_with_wheels(
     torque : torque of (t, mu), or a list of them; optional
         Torques from outside and of motors on the wheels, where mu is ``l_xi``, the angular momentum of the whole and
         those of the wheels: see :mod:`liethermo.torques`. The state then has the work, the heat and the time behind S.
-        For torques that depend on the attitude see :func:`reaction_wheels`.
+        Torques that depend on the attitude need ``attitude=True``.
+    attitude : bool
+        If true, runs follow the attitude of the body, an element of SO(3). The same equations are then those of
+        :func:`reaction_wheels`, in the state (L, p, y): the angular momentum L of the whole in body axes, those of the
+        wheels, ``p_i = J_i (Omega_i + w_i)``, and the entropy y of the bath, whose energy is ``C (T - T_0)``.
 
     Raises
     ------
     InputError
+
+    Examples
+    --------
+    >>> body = lt.models.body_with_wheels(attitude=True)
+    >>> x0 = body.state(angular_velocity=(0.1, 1.0, 0.1), rotor_rates=(0.0, 0.0, 0.5))
+    >>> run = lt.integrate(body, x0, (0.0, 5.0), 0.1)
+    >>> lt.bodies.quaternions(run).shape, lt.bodies.euler_angles(run, "zyx").shape
+    ((51, 4), (51, 3))
     """
     body, wheel = jnp.asarray(checked_inertia(inertia)), checked_positive(wheels, "wheels", 3)
     lagrangian = _Lagrangian(body, wheel, checked_positive(heat, "heat"), checked_positive(temperature, "temperature"))
+    bearing = _BearingFriction(checked_positive(friction, "friction"))
+    if attitude:
+        whole = jnp.diag(wheel) + (body if body.ndim == 2 else jnp.diag(body))
+        return reaction_wheels(whole, jnp.eye(3), wheel, bearing.friction, heat, temperature, torque=torque)
     algebra = mf.direct_sum(mf.so(3), mf.abelian(3))
     external = None
     if torque is not None:
         torque, counts = check_torque(torque, algebra, mf.SO(3))
         if max(counts) > MIN_ARGUMENTS:
             raise InputError(
-                f"body_with_wheels follows no attitude, but its torque {torque_name(torque)} needs it. Use "
-                "lt.models.reaction_wheels, a body with wheels and an attitude"
+                f"body_with_wheels follows no attitude, but its torque {torque_name(torque)} needs it. Give "
+                "attitude=True"
             )
         external = _TorqueOfMomentum(lagrangian, torque, counts)
-    bearing = _BearingFriction(checked_positive(friction, "friction"))
     return EulerPoincareClosedSystem(algebra, lagrangian, bearing, external=external)
 
 

@@ -31,15 +31,13 @@ from .preparation import (
     check_steps,
     checked_method,
     initial_state,
-    is_driven_run,
     limit_family_to_span,
     limit_to_span,
-    prepare_system_and_method,
     refuse_tracers,
-    resolve_invariants,
     why_not_startable,
     wrap_family,
 )
+from .problem import Problem
 from .progress import Progress
 from .record import EnsembleRecord, GroupRecord, TrajectoryGroup
 from .schedule import StepSchedule, make_schedule
@@ -213,27 +211,28 @@ class _EnsembleOptions(NamedTuple):
         attitude : array, shape (m, m) or (B, m, m), or None
         """
         step, schedule, noise = self.step, self.schedule, self.noise
-        member = resolve_invariants(family.member(0), states)
         tolerance = step.tolerance if isinstance(step, Adaptive) else None
-        member, method = prepare_system_and_method(member, self.method, noise, tolerance)
-        family = wrap_family(family, member)
-        states = np.asarray(initial_state(member, states, schedule.start, attitude, batch=True))
-        method.check(member)
-        span = schedule.start, schedule.end, *schedule.breaks
-        family, member = limit_family_to_span(family, member, *span), limit_to_span(member, *span)
-        reasons = {int(numbers[i]): text for i, text in _unstartable_members(family, member, method, states).items()}
+        problem = Problem.from_user(family.member(0), self.method, noise, tolerance, states)
+        method, family = problem.method, wrap_family(family, problem.system)
+        states = np.asarray(initial_state(problem.system, states, schedule.start, attitude, batch=True))
+        family_in_span = limit_family_to_span(family, problem.system, schedule)
+        member = problem.system_in_span(schedule)
+        reasons = {
+            int(numbers[i]): text for i, text in _unstartable_members(family_in_span, member, method, states).items()
+        }
         if reasons:
             startable = np.flatnonzero(~np.isin(numbers, list(reasons)))
             numbers, family, states = numbers[startable], family.select(startable), states[startable]
             if not len(numbers):
                 return None, reasons
-        if is_driven_run(member):
+            family_in_span = family_in_span.select(startable)
+        if problem.is_driven:
             members = family.members_with_extreme_parameters()[: len(states)]
-            systems = [limit_to_span(family.member(i), *span) for i in members]
+            systems = [limit_to_span(family.member(i), schedule) for i in members]
             schedule = schedule_around_features(schedule, systems, states[members], step)
             if schedule is not self.schedule:
-                span = schedule.start, schedule.end, *schedule.breaks
-                family, member = limit_family_to_span(family, member, *span), limit_to_span(member, *span)
+                family_in_span = limit_family_to_span(family, problem.system, schedule)
+                member = problem.system_in_span(schedule)
         events = None if self.until is None else EventSet(self.until, member, schedule.start, states[0])
         control = noise_paths = None
         if tolerance is not None or events is not None:
@@ -241,9 +240,10 @@ class _EnsembleOptions(NamedTuple):
         if noise is not None and noise_dimension(method):
             noise_paths = NoisePaths(noise, noise_dimension(method), numbers, schedule)
         h = schedule.h if tolerance is None else np.nan
-        return TrajectoryGroup(
-            numbers, family, member, method, states, schedule, h, control, events, noise_paths
-        ), reasons
+        group = TrajectoryGroup(
+            numbers, problem, family_in_span, member, states, schedule, h, control, events, noise_paths
+        )
+        return group, reasons
 
     def run_group(self, record: GroupRecord, report: Callable[[float], None]) -> None:
         """Run a group of trajectories; ``report`` is called with the number of finished ones."""

@@ -138,7 +138,7 @@ def flow(
     times = None if save_at is None else checked_save_times(save_at, schedule)
     n, user_system = system.dim, system
     system, method = prepare_for_method(system, method, None, attitude is not None)
-    system = limit_to_span(system, schedule.start, schedule.end, *schedule.breaks)
+    system = limit_to_span(system, schedule)
     initial_arguments = x, schedule.start, attitude
     # the values of a traced state are unknown, so it cannot be checked
     x = jnp.asarray(

@@ -36,6 +36,7 @@ from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import is_library_object
 from .adaptive import Adaptive
 from .noise import DEFAULT_NOISE_METHOD, Fluctuations
+from .schedule import StepSchedule
 from .system_family import Family
 
 Result = TypeVar("Result")
@@ -207,25 +208,26 @@ MAX_LIMITED_SYSTEMS = 64
 _limited_systems: LRUCache[tuple[System, System]] = LRUCache(MAX_LIMITED_SYSTEMS)
 
 
-def limit_to_span(system: System, start: float, end: float, *breaks: float) -> System:
-    """Return the prepared system with its functions of time evaluated only at times from ``start`` to ``end``.
+def limit_to_span(system: System, schedule: StepSchedule) -> System:
+    """Return the prepared system with its functions of time evaluated only at times within the span of a schedule.
 
-    At the ``breaks`` within the span functions of time may jump. Equal arguments return the same object, so that cached
+    At the breaks within the span functions of time may jump. Equal arguments return the same object, so that cached
     results are shared.
     """
+    span = schedule.start, schedule.end, *schedule.breaks
     if not is_driven_run(system):
         return system
     if is_traced(system):
-        return set_time_span(system, start, end, *breaks)
+        return set_time_span(system, *span)
     # the value holds the system, so that its id stays its own
-    return _limited_systems.get_or_compute(
-        (id(system), start, end, breaks), lambda: (system, set_time_span(system, start, end, *breaks))
-    )[1]
+    key = id(system), *span
+    return _limited_systems.get_or_compute(key, lambda: (system, set_time_span(system, *span)))[1]
 
 
-def limit_family_to_span(family: Family, system: System, start: float, end: float, *breaks: float) -> Family:
-    """Return the family with each member limited to a span; ``system`` is one of the members."""
-    return family.map_members_with_numbers(set_time_span, start, end, *breaks) if is_driven_run(system) else family
+def limit_family_to_span(family: Family, system: System, schedule: StepSchedule) -> Family:
+    """Return the family with each member limited to the span of a schedule; ``system`` is one of the members."""
+    span = schedule.start, schedule.end, *schedule.breaks
+    return family.map_members_with_numbers(set_time_span, *span) if is_driven_run(system) else family
 
 
 def is_driven_run(system: System) -> bool:

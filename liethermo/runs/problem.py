@@ -105,8 +105,7 @@ class Problem:
 
     def system_in_span(self, schedule: StepSchedule) -> System:
         """Return the system with its functions of time evaluated within the span of a schedule only."""
-        span = schedule.start, schedule.end, *schedule.breaks
-        return limit_to_span(self.system, *span) if self.is_driven else self.system
+        return limit_to_span(self.system, schedule) if self.is_driven else self.system
 
     def engine(
         self, requested_engine: str, system: System, planned_steps: int, noise_increments: Callable | None = None

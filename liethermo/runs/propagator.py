@@ -52,6 +52,8 @@ MAX_CACHED_SCHEDULES = 32
 MAX_CACHED_SCHEDULE_STEPS = 10_000
 """Largest number of steps of a schedule that is held in memory."""
 
+_schedules: LRUCache[StepSchedule] = LRUCache(MAX_CACHED_SCHEDULES)
+
 
 class Propagator:
     """A system, a method and a step, prepared once: for optimisers, samplers and control loops.
@@ -111,7 +113,6 @@ class Propagator:
         self.system, self.method, self.step, self.engine, self.noise = system, method, step, engine, noise
         self._variants: LRUCache[Propagator] = LRUCache(MAX_CACHED_PARAMETER_SETS)
         self._decided_problem: Problem | None = None
-        self._schedules: LRUCache[StepSchedule] = LRUCache(MAX_CACHED_SCHEDULES)
         self._thread = _ThreadFunctions()
 
     def __getstate__(self) -> tuple:
@@ -291,15 +292,16 @@ class Propagator:
     def _schedule(
         self, t_span, save_every: int, save_at, allow_infinite_end: bool, breaks, declared: DeclaredTimes
     ) -> StepSchedule:
-        """Return the schedule of a run; short schedules are cached, and those used last are kept."""
-        if save_at is not None or allow_infinite_end or np.size(breaks) or any(declared) or type(save_every) is not int:
+        """Return the schedule of a run; short ones that were used last, by any propagator, are cached."""
+        kind, is_plain = type(self.step), save_at is None and not allow_infinite_end and not np.size(breaks)
+        if not is_plain or any(declared) or type(save_every) is not int or kind not in (float, int, Adaptive):
             return make_schedule(t_span, self.step, save_every, save_at, allow_infinite_end, breaks, declared)
-        key = *checked_span(t_span), save_every
-        schedule = self._schedules.get(key)
+        key = *checked_span(t_span), save_every, kind if kind is Adaptive else self.step
+        schedule = _schedules.get(key)
         if schedule is None:
             schedule = make_schedule(key[:2], self.step, save_every)
             if schedule.n_steps <= MAX_CACHED_SCHEDULE_STEPS:
-                self._schedules.get_or_compute(key, lambda: schedule)
+                _schedules.get_or_compute(key, lambda: schedule)
         return schedule
 
     def _final_state_function(self, t_span, varied: VariedParameters | None = None) -> FinalStateFunction | None:

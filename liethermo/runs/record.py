@@ -15,7 +15,6 @@ from ..engines.select_engine import EngineWithFallback
 from ..engines.status_codes import StatusCode
 from ..engines.step import energy_or_entropy_that_relaxes
 from ..engines.step_control import StepControl
-from ..integrators import OneStepMethod
 from ..integrators.fluctuating import noise_dimension
 from ..results.audit_evidence import (
     MAX_LOCAL_ERROR_STEPS,
@@ -47,7 +46,8 @@ from ..systems.states import reshape_to_sites
 from ..tracing.interpret import evaluate_at_points
 from .events import EventSet, collect_events
 from .noise import NoisePaths
-from .preparation import invariants_and_laws, promised_laws
+from .preparation import invariants_and_laws
+from .problem import Problem
 from .schedule import StepSchedule
 from .solution_builder import (
     EngineReplay,
@@ -87,11 +87,12 @@ class TrajectoryGroup(NamedTuple):
     ----------
     numbers : array of int, shape (B,)
         Numbers of the trajectories in the ensemble, increasing.
+    problem : Problem
+        The problem of one of them, whose method and laws belong to all.
     family : Family
         Their systems.
     member : System
         One member of the family.
-    method : OneStepMethod
     x0 : array, shape (B, n)
         Initial states.
     schedule : StepSchedule
@@ -105,9 +106,9 @@ class TrajectoryGroup(NamedTuple):
     """
 
     numbers: np.ndarray
+    problem: Problem
     family: Family
     member: System
-    method: OneStepMethod
     x0: np.ndarray
     schedule: StepSchedule
     h: float
@@ -205,7 +206,7 @@ class EnsembleRecord:
             attitude=attitude,
             attitude0=attitude0,
             work=work,
-            laws=common_laws([promised_laws(group.member, group.method, {}) for group in self.groups]),
+            laws=common_laws([group.problem.laws for group in self.groups]),
             engine=engine,
             events=Events() if events is None else collect_events(self.member, events.names, self.events),
             reasons={**reasons, **self.failure_reasons},
@@ -263,7 +264,8 @@ class GroupRecord:
     """
 
     def __init__(self, record: EnsembleRecord, group: TrajectoryGroup):
-        self.numbers, self.family, self.member, self.method, self.x0, self.schedule, self.h = group[:7]
+        self.numbers, self.problem, self.family, self.member, self.x0, self.schedule, self.h = group[:7]
+        self.method = self.problem.method
         self.control, self.events, self.noise = group[7:]
         self.record, self.engine = record, ""
         self._is_all = len(self.numbers) == len(record.status)
@@ -580,14 +582,16 @@ def _sampled_saved_states(
 
 
 def common_laws(laws_of_groups: Sequence[Laws]) -> Laws:
-    """Return the laws of an ensemble: what is promised of all groups is conserved, and the rest is not promised."""
+    """Return the laws that hold for all groups: a function is conserved or not promised only if each group has it."""
     first = laws_of_groups[0]
     promised = set.intersection(*(set(laws.conserved) for laws in laws_of_groups))
-    others = [n for laws in laws_of_groups for n in (*laws.conserved, *laws.unpromised) if n not in promised]
+    constants = set.intersection(*({*laws.conserved, *laws.unpromised} for laws in laws_of_groups))
+    names = [name for name in (*first.conserved, *first.unpromised) if name in constants]
     return replace(
         first,
-        conserved=tuple(name for name in first.conserved if name in promised),
-        unpromised=tuple(dict.fromkeys(others)),
+        conserved=tuple(name for name in names if name in promised),
+        unpromised=tuple(name for name in names if name not in promised),
+        unknown=tuple(dict.fromkeys(name for laws in laws_of_groups for name in laws.unknown)),
     )
 
 

@@ -29,7 +29,7 @@ from ..systems import System
 from ..systems.clock import system_of_step
 from ..tracing.interpret import evaluate_at_points
 from .adaptive import Adaptive, make_step_control
-from .adaptive_run import MAX_STORED_VALUES, AcceptedSteps, advance_to_end
+from .adaptive_run import MAX_STORED_VALUES, AcceptedSteps, AdaptiveRun
 from .driver import drive_fixed
 from .events import EventSet, collect_events
 from .noise import NoisePaths
@@ -178,12 +178,13 @@ class Run:
         self.saved_energies_entropies = [np.array([[float(state.energy), float(state.entropy)]])]
         values_per_step = self.system.dim * ((0 if saves_at_stops else 1) / save_every + (self.all_states is not None))
         max_steps = MAX_STORED_VALUES / max(values_per_step, 1e-9)
-        outcome = advance_to_end(self.engine, adaptive_runs, control, stops, save_steps, max_steps, events)
+        outcome = AdaptiveRun(self.engine, adaptive_runs, control, stops, save_steps, max_steps, events)
+        outcome.advance_to_end()
         if unsaved_steps is not None:
             self._save_steps(unsaved_steps, slice(-1, None))
         self.event_time = outcome.event_time
         if events is not None:
-            self.events = collect_events(self.system, events.names, outcome.events)
+            self.events = collect_events(self.system, events.names, outcome.occurrences)
         state, t = outcome.state, self.last_saved_time
         self.stats = run_statistics(state, self._wall_time(), outcome.n_rejected)
         if isinstance(step, Adaptive) and (

@@ -18,7 +18,7 @@ from ..integrators import MetriplecticGauss, MetriplecticRungeKutta, Metriplecti
 from ..integrators.taylor import order_for_tolerance
 from ..systems import System
 from .adaptive import Adaptive, make_step_control
-from .adaptive_run import AcceptedSteps, RunOutcome, advance_to_end
+from .adaptive_run import AcceptedSteps, AdaptiveRun
 from .preparation import checked_initial_state, checked_method, prepare_for_method
 
 
@@ -172,16 +172,17 @@ def _try_method(system: System, x0, rtol: float, method: OneStepMethod, t0: floa
         if len(step_sizes) == 30:
             raise _TrialCompleteError
 
-    def run_trial(rate: float) -> RunOutcome:
+    def run_trial(rate: float) -> AdaptiveRun:
         """Take up to thirty steps over a span of 1e6 / rate."""
         step_sizes.clear()
         iterations[1:] = []
         length = 1e6 / rate
         control = make_step_control(Adaptive(rtol), prepared_method, length, None)
         adaptive_runs = engine.start_adaptive(control, x, 0.0, length, length)
-        return advance_to_end(
-            engine, adaptive_runs, control, np.array([length]), record_first_step, attempts_per_call=1
-        )  # since iterations are counted
+        stops = np.array([length])
+        run = AdaptiveRun(engine, adaptive_runs, control, stops, record_first_step, attempts_per_call=1)
+        run.advance_to_end()  # one attempt a call, since iterations are counted
+        return run
 
     with contextlib.suppress(_TrialCompleteError):
         engine, rate = EngineWithFallback(system, prepared_method, "auto", 1), max_rate / max(norm, 1e-300)

@@ -114,7 +114,7 @@ def event_status(outcome, names: Sequence[str], t: float) -> Status:
     """Return the status of a run that ended at an event, or where an event function is NaN, at time t."""
     steps, residual = int(outcome.state.step), float(outcome.state.residual)
     if outcome.event_time is not None:
-        name = names[outcome.events[-1].function]
+        name = names[outcome.occurrences[-1].function]
         return Status(StatusCode.EVENT, f"{name}: reached at t = {t:.15g} in {steps} steps", steps, t, residual)
     name = names[outcome.undefined_events[0] if outcome.undefined_events else 0]
     text = (
@@ -127,7 +127,10 @@ def event_remarks(outcome, names: Sequence[str], terminal_counts: Sequence[int |
     """Return what a message says of the events of a run that reached its end."""
     text = ""
     for k, name in enumerate(names):
-        jumps, n_events = [t for j, t in outcome.sign_jumps if j == k], sum(e.function == k for e in outcome.events)
+        jumps, n_events = (
+            [t for j, t in outcome.sign_jumps if j == k],
+            sum(e.function == k for e in outcome.occurrences),
+        )
         undefined_ends = [t for j, t in outcome.undefined_ends if j == k]
         if undefined_ends:
             repeats = f" (and {len(undefined_ends) - 1} times more)" if len(undefined_ends) > 1 else ""

@@ -29,6 +29,28 @@ def points(g):
     return np.array([state_of(g, seed) for seed in range(SAMPLES)])
 
 
+REASON_FOR_NO_CASE = {
+    "AdiabaticJumps": "it acts on density matrices: see test_adiabatic",
+    "BathConduction": "it acts on baths alone: see test_bath_conduction",
+    "Friction": "it acts on velocities: see test_torques and test_factor",
+    "LandauLifshitz": "it acts on spins: see test_planes and the tests of peers",
+    "LindbladJumps": "it acts on density matrices: see test_lindblad",
+    "LocalProjectedMetric": "it acts on sites: see test_sites",
+    "SteepestEntropyAscent": "it acts on density matrices: see test_quantum",
+    "ThermalJumps": "it acts on density matrices: see test_quantum",
+}
+"""Reason why a public dissipation is no case of ``DISSIPATIONS``."""
+
+
+def test_every_dissipation_is_a_case_or_has_a_reason():
+    classes = [getattr(lt, name) for name in lt.__all__]
+    names = {c.__name__ for c in classes if isinstance(c, type) and issubclass(c, lt.Dissipation)}
+    terms = [term for case in DISSIPATIONS for term in build(mf.so(3), case).dissipations]
+    tested_names = {base.__name__ for term in terms for base in type(term).__mro__}
+    missing = names - tested_names - set(REASON_FOR_NO_CASE)
+    assert not missing, f"add a case to DISSIPATIONS in tests/cases.py, or a reason here: {sorted(missing)}"
+
+
 @pytest.mark.sampled(8)
 @pytest.mark.parametrize(("g", "case"), combinations(ALGEBRAS))
 def test_axioms_hold(g, case):

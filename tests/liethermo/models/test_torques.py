@@ -55,6 +55,24 @@ def reference(torque, with_wheels, motor=None):
     return Rotation.from_quat(s[:4]).as_matrix(), s[4:7], s[7:]
 
 
+def wheels_reference(J, k, capacity, temperature, wheel_rates, torque):
+    """Attitude matrix, angular velocity, rates of three wheels about body axes, and temperature at END."""
+    M = np.block([[INERTIA + np.diag(J), np.diag(J)], [np.diag(J), np.diag(J)]])
+
+    def f(t, s):
+        x, y, z, w = s[:4]
+        (p, q, r), velocity = s[4:7], s[4:10]
+        dq = 0.5 * np.array([w * p + y * r - z * q, w * q + z * p - x * r, w * r + x * q - y * p,
+                             -x * p - y * q - z * r])  # fmt: skip
+        L, g = (M @ velocity)[:3], Rotation.from_quat(s[:4]).as_matrix()
+        right = np.concatenate([np.cross(L, s[4:7]) + torque(g), -k * s[7:10]])
+        return np.concatenate([dq, np.linalg.solve(M, right), [k * s[7:10] @ s[7:10] / capacity]])
+
+    s0 = np.concatenate([START.as_quat(), RATES, wheel_rates, [temperature]])
+    s = solve_ivp(f, (0.0, END), s0, "DOP853", rtol=1e-12, atol=1e-13, max_step=0.1).y[:, -1]
+    return Rotation.from_quat(s[:4]).as_matrix(), s[4:7], s[7:10], s[10]
+
+
 def run(torque, with_wheels, **options):
     if with_wheels:
         system = lt.models.reaction_wheels(INERTIA, AXES, WHEELS, BEARINGS, torque=torque)
@@ -229,8 +247,38 @@ def test_a_body_with_wheels_takes_torques_that_need_no_attitude():
     force = system.external_force(x[:6], x[6], 0.0)  # on the momentum l_xi, of the whole and of the wheels
     assert np.allclose(force, [0.1, 0, 0, 0, 0, 0.05], atol=1e-15)
     assert lt.integrate(system, x, (0.0, 1.0), 0.1).audit().passed
-    with pytest.raises(lt.InputError, match="reaction_wheels"):
+    with pytest.raises(lt.InputError, match="attitude=True"):
         lt.models.body_with_wheels(torque=T.ConstantInSpace([0.1, 0.0, 0.0]))
+
+
+def test_the_attitude_of_a_body_with_three_wheels_beside_an_integration_in_coordinates():
+    wheels, k, torque = np.array([0.3, 0.2, 0.1]), 0.2, np.array([0.1, -0.2, 0.05])
+    options = {"inertia": INERTIA, "wheels": wheels, "friction": k, "heat": 2.0, "temperature": 1.5}
+    velocity = {"angular_velocity": RATES, "rotor_rates": [1.0, -2.0, 0.5]}
+    system = lt.models.body_with_wheels(**options, attitude=True, torque=T.ConstantInSpace(torque))
+    solution = lt.integrate(system, system.state(**velocity), (0.0, END), STEP, lt.MetriplecticGauss(3), attitude=START)
+    g, omega, rates, temperature = wheels_reference(wheels, k, 2.0, 1.5, [1.0, -2.0, 0.5], lambda g: g.T @ torque)
+    assert np.abs(lt.bodies.rotation(solution)[-1].as_matrix() - g).max() < ACCURACY
+    q = Rotation.from_matrix(g).as_quat()
+    assert min(np.abs(lt.bodies.quaternions(solution)[-1] - s * q).max() for s in (1.0, -1.0)) < ACCURACY
+    angles = Rotation.from_matrix(g).as_euler("zyx")
+    assert np.abs(lt.bodies.euler_angles(solution, "zyx")[-1] - angles).max() < 2.0 * ACCURACY
+    assert np.abs(lt.bodies.angular_velocity(solution)[-1] - omega).max() < ACCURACY
+    assert np.abs(system.energy.gradient(jnp.asarray(solution.x[-1]))[3:6] - rates).max() < 2.0 * ACCURACY
+    assert float(system.temperatures(solution.x)[-1, 0]) == pytest.approx(temperature, abs=ACCURACY)
+    assert solution.audit().passed
+
+
+def test_a_body_with_wheels_moves_alike_with_and_without_its_attitude():
+    velocity = {"angular_velocity": RATES, "rotor_rates": [1.0, -2.0, 0.5]}
+    runs = []
+    for attitude in (False, True):
+        system = lt.models.body_with_wheels((3.0, 2.0, 1.5), (0.3, 0.2, 0.1), attitude=attitude)
+        runs.append(lt.integrate(system, system.state(**velocity), (0.0, END), STEP, lt.MetriplecticGauss(3)))
+    plain, followed = runs
+    assert np.abs(lt.bodies.angular_velocity(plain) - lt.bodies.angular_velocity(followed)).max() < ACCURACY
+    momentum = np.einsum("tij,tj->ti", followed.attitude, followed.x[:, :3])
+    assert np.abs(momentum - momentum[0]).max() < 1e-14
 
 
 def test_reaction_wheels_with_one_wheel_are_a_damper_wheel():

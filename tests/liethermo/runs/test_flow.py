@@ -392,8 +392,8 @@ def test_a_linearised_flow_in_another_program():
     ("arguments", "message"),
     [
         ({"system": lambda x: x}, "needs a system.*got function"),
-        ({"method": "DOP853"}, "OneStepMethod.*got 'DOP853'"),
-        ({"method": lt.Reference()}, "OneStepMethod.*got Reference"),
+        ({"method": "DOP853"}, "must be an integrator.*got 'DOP853'"),
+        ({"method": lt.Reference()}, "Reference runs single trajectories"),
         ({"step": lt.Adaptive(1e-6)}, "needs a fixed step.*lt.integrate"),
     ],
     ids=["system", "name", "reference", "adaptive"],

@@ -236,6 +236,19 @@ def test_an_interruption_stops_all_groups(monkeypatch):
     assert ensemble.status.tolist() == [StatusCode.INTERRUPTED] * 3
 
 
+def test_the_laws_of_an_ensemble_are_those_of_a_single_run_as_far_as_all_have_them():
+    """Isotropic bodies conserve a Casimir that the others dissipate; without dissipation all conserve it."""
+    single = lt.integrate(lt.models.free_rigid_body(), START, SPAN, STEP)
+    ensemble = lt.ensemble(lt.models.free_rigid_body(), [START, START], SPAN, STEP)
+    assert ensemble.laws == single.laws
+    assert single.laws.conserved
+    damped, moments = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2), [[2.0, 2.0, 2.0], [3.0, 2.0, 1.0]]
+    mixed = lt.ensemble(damped, [START, START], SPAN, STEP, parameters={"energy.inertia": np.array(moments)})
+    assert mixed[0].laws.conserved
+    assert not mixed[1].laws.conserved
+    assert (mixed.laws.conserved, mixed.laws.unpromised) == ((), ())
+
+
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("outputs", ["final", "trajectory", "summary"])
 def test_files_of_mixed_groups(tmp_path, outputs):

@@ -241,3 +241,15 @@ def test_what_is_conserved_is_found_once_for_each_set_of_parameters(monkeypatch)
     for rate in (0.11, 0.12, 0.13):
         p([0.1, 0.2, 1.0], (0.0, 2.0), parameters={"dissipation.rate": rate})
     assert len(tested) == 3
+
+
+def test_propagators_of_other_steps_do_not_share_a_schedule():
+    body, x0, span = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2), [0.1, 0.2, 1.0], (0.0, 1.0)
+    for step, n_times, n_times_of_every_second in ((0.5, 3, 2), (0.25, 5, 3), (1, 2, 2), (0.5, 3, 2)):
+        assert len(lt.Propagator(body, None, step)(x0, span).t) == n_times
+        assert len(lt.integrate(body, x0, span, step, save_every=2).t) == n_times_of_every_second
+    for invalid_step in ("half", None, -0.5):
+        with pytest.raises(lt.InputError, match="step must be"):
+            lt.integrate(body, x0, span, invalid_step)
+    adaptive = lt.integrate(body, x0, span, lt.Adaptive(1e-6))
+    assert len(lt.integrate(body, x0, span, lt.Adaptive(1e-9)).t) > len(adaptive.t)
