@@ -12,7 +12,7 @@ from ..errors import InputError
 from ..functions.bath_energy import BathEnergy
 from ..functions.conditions import checked_numbers, require_condition
 from ..functions.energy import Energy, Quadratic
-from ..functions.inverse_gradient import inverse_gradient
+from ..functions.newton import inverse_gradient
 from .baths import HeatBaths
 
 VELOCITY_RTOL = 1e-12

@@ -19,6 +19,7 @@ from ..dissipation.base import LawName
 from ..errors import InputError
 from ..functions.arguments import LastArgumentIgnored, required_argument_count
 from ..functions.checks import traced_function_and_shape
+from ..functions.newton import nan_unless_small, newton_iterate
 from ..tracing.interpret import evaluate_at_points
 from .herglotz import random_states
 from .ledger import FlattenedFunction, ForcesAndHeat
@@ -127,15 +128,12 @@ class SemibasicForm(Module):
             eta = self.function(q, v, S, s)
             return jnp.dot(eta[:-1], v) + eta[-1] * s, jnp.abs(eta[:-1]) @ jnp.abs(v) + jnp.abs(eta[-1] * s)
 
-        def newton(_, s):
-            (value, _), (slope, _) = jax.jvp(residual, (s,), (jnp.ones(()),))
-            return s - value / slope
-
-        s = jax.lax.fori_loop(0, N_NEWTON_ITERATIONS if self.is_implicit else 1, newton, jnp.zeros(()))
+        n_steps = N_NEWTON_ITERATIONS if self.is_implicit else 1
+        s = newton_iterate(lambda s: residual(s)[0], jnp.zeros(()), n_steps)
         if not self.is_implicit:  # linear in S'
             return s
         value, scale = residual(s)
-        return jnp.where(jnp.abs(value) <= CONSTRAINT_RTOL * scale, s, jnp.nan)
+        return nan_unless_small(s, value, CONSTRAINT_RTOL * scale)
 
     def force_covector(self, q, v, S) -> jax.Array:
         """Return ``eta_q / eta_S``, shape (n,), at (q, v, S) and the S' that belongs to them."""

@@ -18,7 +18,7 @@ from ..dissipation.force import EulerPoincareForce
 from ..errors import InputError
 from ..functions.checks import checked_energy
 from ..functions.energy import Energy, Quadratic, TimeDependent, make_energy
-from ..functions.inverse_gradient import inverse_gradient
+from ..functions.newton import inverse_gradient
 from ..tracing.interpret import evaluate_at_points
 from .interface import EngineHints
 from .lie_poisson import LiePoissonSystem

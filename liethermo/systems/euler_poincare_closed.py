@@ -18,7 +18,7 @@ from ..errors import InputError
 from ..functions.checks import checked_energy, with_polynomial_degrees
 from ..functions.conditions import require_condition
 from ..functions.energy import Energy, Function, make_energy
-from ..functions.inverse_gradient import inverse_gradient
+from ..functions.newton import inverse_gradient
 from ..tracing.traced import trace_callables
 from .body_states import checked_velocity, is_given_by_velocity
 from .euler_poincare import require_regular

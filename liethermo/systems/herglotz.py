@@ -17,8 +17,8 @@ from manifolds.matrices.linear import inverse
 from ..errors import InputError
 from ..functions.checks import checked_energy, with_polynomial_degrees
 from ..functions.energy import Energy, Quadratic, make_energy
-from ..functions.inverse_gradient import inverse_gradient
 from ..functions.mechanics import Kinetic, is_independent_of_momenta
+from ..functions.newton import inverse_gradient
 from ..tracing.programs import jit_cached
 from .euler_poincare import require_regular
 from .evolution import (

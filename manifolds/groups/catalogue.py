@@ -9,7 +9,6 @@ from ..matrices.linear import adjoint, newton_schulz_step
 from . import closed_forms as closed
 from . import maps
 from .matrix_group import MatrixGroup, register
-from .rotations import rotation_log
 
 # -- the groups -----------------------------------------------------------------------------------------------------
 
@@ -35,7 +34,7 @@ def SO(n: int) -> MatrixGroup:
         catalogue.so(n),
         closed.special_unitary_defect,
         adjoint,
-        log_map=rotation_log,
+        log_map=closed.rotation_log,
         adjoint_cayley_map=None,
         restore_map=newton_schulz_step,
         equations=closed.orthogonal_equations,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,9 +18,9 @@ import numpy as np
 
 import manifolds as mf
 from manifolds._pytree_module import Module
-from manifolds.matrices.linear import solve
 
 from ...errors import InputError
+from ...functions.newton import newton_iterate
 from ...functions.surface import ConstraintSurface
 from ...systems import SimpleClosedSystem
 
@@ -286,12 +286,9 @@ class DiscreteSystem(Module):
     def end_entropy_on_constraint(self, q0, q1, S0, steps: int = 12) -> jax.Array:
         """Return S_1 with ``P_d(q_0, q_1, S_0, S_1) = 0`` after ``steps`` Newton steps; differentiable."""
         V = (q1 - q0) / self.h
-
-        def newton(_, s):
-            residual, slope = jax.jvp(lambda s: self.constraint_residual(Pair(q0, V, S0, s)), (s,), (jnp.ones(()),))
-            return s - residual / slope
-
-        return S0 + self.h * jax.lax.fori_loop(0, steps, newton, jnp.zeros(()))
+        return S0 + self.h * newton_iterate(
+            lambda s: self.constraint_residual(Pair(q0, V, S0, s)), jnp.zeros(()), steps
+        )
 
     def flow(self, q0, q1, S0, S1, steps: int = 12) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """Return the discrete flow on ``C_K^d``, (q_1, q_2, S_1, S_2), after ``steps`` Newton steps [GBY 3.14]."""
@@ -301,13 +298,8 @@ class DiscreteSystem(Module):
             pair = Pair(q1, y[:-1], S1, y[-1])
             return jnp.append(self.motion_residual(p1, pair), self.constraint_residual(pair))
 
-        y = jax.lax.fori_loop(0, steps, lambda _, y: newton_correction(residual, y), start)
+        y = newton_iterate(residual, start, steps)
         return q1, q1 + self.h * y[:-1], S1, S1 + self.h * y[-1]
-
-
-def newton_correction(residual: Callable, y) -> jax.Array:
-    """Return y after one step of Newton's method for ``residual(y) = 0``, shape (n,) each."""
-    return y - solve(jax.jacfwd(residual)(y), residual(y)[:, None])[:, 0]
 
 
 def _sum_arrays(arrays: list[jax.Array]) -> jax.Array:

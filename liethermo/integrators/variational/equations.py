@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 
-from manifolds.matrices.linear import solve
-
+from ...functions.newton import jacobian_and_value, nan_unless_small, newton_correction, newton_iterate
 from ...functions.surface import ConstraintSurface
 from ...systems import SimpleClosedSystem
 from ...tracing.interpret import polynomial_degree_bound
@@ -25,30 +22,21 @@ def newton_step(discrete: DiscreteSystem, start_velocity, p0, guess: Pair) -> tu
         and polynomial_degree_bound(_motion_residual_of_s, (discrete, p0, guess), 1) == 0
     )
     if is_affine:
-        A, residual = _jacobian_and_value(
+        A, residual = jacobian_and_value(
             lambda V: discrete.motion_residual(p0, Pair(q0, V, S0, jnp.zeros(()))), jnp.zeros(n)
         )
-        V = -solve(A, residual[:, None])[:, 0]
+        V = -newton_correction(A, residual)
     else:  # (3.15), s eliminated
 
         def motion_and_constraint(V, s):
             pair = Pair(q0, V, S0, s)
             return discrete.motion_residual(p0, pair, mass), discrete.constraint_residual(pair)
 
-        ((A, B), (C, D)), (residual, constraint_value) = _jacobian_and_value(motion_and_constraint, V, s)
-        V = V - solve(A - jnp.outer(B, C) / D, (residual - B * (constraint_value / D))[:, None])[:, 0]
+        ((A, B), (C, D)), (residual, constraint_value) = jacobian_and_value(motion_and_constraint, V, s)
+        V = V - newton_correction(A - jnp.outer(B, C) / D, residual - B * (constraint_value / D))
     s = jnp.zeros(()) if polynomial_degree_bound(_constraint_residual_of_s, (discrete, p0, guess), 1) <= 1 else s
-    slope, constraint_value = _jacobian_and_value(lambda s: discrete.constraint_residual(Pair(q0, V, S0, s)), s)
+    slope, constraint_value = jacobian_and_value(lambda s: discrete.constraint_residual(Pair(q0, V, S0, s)), s)
     return V, s - constraint_value / slope
-
-
-def _jacobian_and_value(function: Callable, *arguments):
-    """Return the derivatives of a function by all of its arguments, and its value."""
-    return jax.jacfwd(
-        lambda *a: (lambda y: (y, y))(function(*a)),
-        argnums=tuple(range(len(arguments))) if len(arguments) > 1 else 0,
-        has_aux=True,
-    )(*arguments)
 
 
 def _motion_residual_of_V(fixed_arguments, V):
@@ -78,9 +66,9 @@ def velocity_slope(system: SimpleClosedSystem, start, end, force, h) -> jax.Arra
     (_, v0, _, p0), (q1, slope, S1) = start, end
     affine = polynomial_degree_bound(_momentum_of_v, (system, q1, S1), len(v0)) <= 1
     slope = jnp.zeros_like(v0) if affine else slope
-    W, p = _jacobian_and_value(lambda v: system.momentum(q1, v, S1), v0 + h * slope)
+    W, p = jacobian_and_value(lambda v: system.momentum(q1, v, S1), v0 + h * slope)
     W, residual = _restrict_to_tangents(system, q1, v0 + h * slope, W, (p - p0) / h - force, h)
-    return slope - solve(W, residual[:, None])[:, 0]
+    return slope - newton_correction(W, residual)
 
 
 def _restrict_to_tangents(
@@ -116,11 +104,12 @@ def _momentum_of_v(fixed_arguments, v):
 def velocity_from_momentum(system: SimpleClosedSystem, q, S, p, velocity_guess):
     """Return v with ``L_v(q, v, S) = p``, near a guess; NaN if Newton's method does not converge."""
 
-    def newton(_, v):
-        W, momentum = _jacobian_and_value(lambda v: system.momentum(q, v, S), v)
-        W, residual = _restrict_to_tangents(system, q, v, W, momentum - p)
-        return v - solve(W, residual[:, None])[:, 0]
+    def momentum_residual(v):
+        return system.momentum(q, v, S) - p
 
-    velocity_guess = jax.lax.fori_loop(0, 20, newton, velocity_guess)
-    max_residual = jnp.max(jnp.abs(system.tangential_part(q, system.momentum(q, velocity_guess, S) - p)))
-    return jnp.where(max_residual <= 1e-12 * (1.0 + jnp.max(jnp.abs(p))), velocity_guess, jnp.nan)
+    def tangent_jacobian_and_value(function, v):
+        return _restrict_to_tangents(system, q, v, *jacobian_and_value(function, v))
+
+    v = newton_iterate(momentum_residual, velocity_guess, 20, tangent_jacobian_and_value)
+    residual = system.tangential_part(q, momentum_residual(v))
+    return nan_unless_small(v, residual, 1e-12 * (1.0 + jnp.max(jnp.abs(p))))

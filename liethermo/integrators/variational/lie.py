@@ -17,6 +17,7 @@ from manifolds.matrices.linear import solve
 
 from ...errors import InputError
 from ...functions.conditions import require_condition
+from ...functions.newton import newton_correction, newton_iterate
 from ...systems import EulerPoincareClosedSystem, System
 from ...tracing.programs import jit_cached
 from ..base import (
@@ -27,7 +28,6 @@ from ..base import (
     kind_or_class_name,
     register,
 )
-from .discrete import newton_correction
 
 NEWTON_STEPS = 20
 """Newton steps for the velocities between the states of a finished run."""
@@ -116,11 +116,11 @@ class LieVariational(OneStepMethod):
         def residual(y):
             return jnp.append(mu0 - step.momenta(y)[0], step.constraint_residual(y))
 
-        y = newton_correction(residual, jnp.append(k[1, :n], k[0, n]))
+        y = newton_iterate(residual, jnp.append(k[1, :n], k[0, n]), 1)
         S1, mu1 = S0 + h * y[n], step.momenta(y)[1]
         guess = xi0 + h * k[0, :n]
         W = jax.jacfwd(system.momentum)(guess, S1)
-        xi_dot = k[0, :n] - solve(W, ((system.momentum(guess, S1) - mu1) / h)[:, None])[:, 0]
+        xi_dot = k[0, :n] - newton_correction(W, (system.momentum(guess, S1) - mu1) / h)
         ledger = system.ledger_rates(*step.work_and_heat_rates(y))
         return jnp.stack([jnp.concatenate([xi_dot, y[n:], ledger]), jnp.zeros_like(x).at[:n].set(y[:n])])
 
@@ -210,7 +210,7 @@ def _group_increments(method: LieVariational, system: EulerPoincareClosedSystem,
         def residual(xi):
             return mu0 - step.momenta(jnp.append(xi, s))[0]
 
-        xi = jax.lax.fori_loop(0, NEWTON_STEPS, lambda _, xi: newton_correction(residual, xi), 0.5 * (xi0 + xi1))
+        xi = newton_iterate(residual, 0.5 * (xi0 + xi1), NEWTON_STEPS)
         return tau(system.algebra, h * xi)
 
     return jax.vmap(group_increment)(x[:-1], x[1:])

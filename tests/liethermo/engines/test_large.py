@@ -11,9 +11,8 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.dissipation.base import Dissipation
 from liethermo.engines import array_engine
-from liethermo.engines.krylov import solve_krylov
 from liethermo.engines.solver_options import DEFAULT_OPTIONS
-from liethermo.engines.stage_solver import IterationState, StageEquations, solve_newton, solve_stages
+from liethermo.engines.stage_solver import IterationState, StageEquations, solve_krylov, solve_newton, solve_stages
 from liethermo.engines.step import initial_run_state_program
 from liethermo.runs.preparation import checked_initial_state, prepare_system_and_method
 

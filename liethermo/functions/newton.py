@@ -1,6 +1,8 @@
-"""The inverse of the gradient of an energy: the point at which the gradient has a given value."""
+"""Newton's method: roots by a fixed number of steps, and the inverse of the gradient of an energy by damped steps."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -14,6 +16,35 @@ MAX_NEWTON_ITERATIONS = 50
 """Number of Newton steps after which an equation for a gradient counts as having no solution."""
 
 
+def jacobian_and_value(function: Callable, *arguments):
+    """Return the derivatives of a function by all of its arguments, and its value."""
+    return jax.jacfwd(
+        lambda *a: (lambda y: (y, y))(function(*a)),
+        argnums=tuple(range(len(arguments))) if len(arguments) > 1 else 0,
+        has_aux=True,
+    )(*arguments)
+
+
+def newton_correction(jacobian, residual) -> jax.Array:
+    """Return the step that Newton's method subtracts: numbers, or shapes (n, n) and (n,)."""
+    return residual / jacobian if jnp.ndim(residual) == 0 else solve(jacobian, residual[:, None])[:, 0]
+
+
+def newton_iterate(function: Callable, start, n_steps: int, jacobian_and_value: Callable = jacobian_and_value):
+    """Return y after some steps of Newton's method for ``function(y) = 0``, a number or shape (n,); differentiable.
+
+    Parameters
+    ----------
+    jacobian_and_value : function of ``function`` and y, optional
+    """
+    return jax.lax.fori_loop(0, n_steps, lambda _, y: y - newton_correction(*jacobian_and_value(function, y)), start)
+
+
+def nan_unless_small(y, residual, bound) -> jax.Array:
+    """Return y, or NaN if an entry of the residual exceeds the bound."""
+    return jnp.where(jnp.max(jnp.abs(residual)) <= bound, y, jnp.nan)
+
+
 @eqx.filter_custom_jvp
 def inverse_gradient(lagrangian: Energy, mu: jax.Array) -> jax.Array:
     """Return xi with ``grad lagrangian (xi) = mu``, shape (n,), by damped Newton; NaN if it finds none."""
@@ -23,7 +54,7 @@ def inverse_gradient(lagrangian: Energy, mu: jax.Array) -> jax.Array:
 
     def refine(carry):
         xi, r, _, k = carry
-        step = solve(jax.hessian(lagrangian.value)(xi), r[:, None])[:, 0]
+        step = newton_correction(jax.hessian(lagrangian.value)(xi), r)
 
         def shorten(state):
             t, _ = state
@@ -56,4 +87,4 @@ def _inverse_gradient_jvp(primals, tangents):
     if any(tangent is not None for tangent in jax.tree_util.tree_leaves(lagrangian_dot)):
         _, gradient_dot = eqx.filter_jvp(lambda lagrangian: lagrangian.gradient(xi), (lagrangian,), (lagrangian_dot,))
         change = change - gradient_dot
-    return xi, solve(jax.hessian(lagrangian.value)(xi), change[:, None])[:, 0]
+    return xi, newton_correction(jax.hessian(lagrangian.value)(xi), change)
