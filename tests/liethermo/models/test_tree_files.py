@@ -107,7 +107,7 @@ def test_an_mjcf_file_is_the_tree_built_by_hand():
         (URDF.replace('<axis xyz="0 0 1"/>', '<axis xyz="0 0 0"/>'), "the joint of 'panel' cannot be used: the axis"),
         (URDF.replace('damping="0.3"', 'damping="-0.3"'), "the joint of 'panel' cannot be used: damping"),
         (URDF.replace('<joint name="fixed" type="fixed"><parent link="bus"/>',
-                      '<joint name="ring" type="continuous"><parent link="mass"/>'), "the links mass, panel, yoke are in a loop of joints"),
+                      '<joint name="ring" type="continuous"><parent link="mass"/>'), "are in a loop of joints"),
         (URDF.replace('iyy="0.4"', 'iyy="9"'), "no rigid body has the inertia of 'panel'"),
         ("<mujoco/>", "the root element 'robot'"),
     ],
