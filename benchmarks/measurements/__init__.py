@@ -4,6 +4,7 @@ MEASUREMENT_NAMES = (
     "single_body",
     "calls",
     "isolated_body",
+    "tree",
     "general",
     "functions",
     "variational",

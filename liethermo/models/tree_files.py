@@ -417,7 +417,7 @@ def _records(groups: dict[str, _Group], has_ground: bool) -> list[BodyRecord]:
             child.parent, child.at, child.joints = group.parent, group.at, group.joints + child.joints
     for group in groups.values():
         if group.masses and not (has_ground and group.parent is None):
-            records.append(group.record(None if group.parent is None else _joint_of(group)))
+            records.append(group.record(None if group.parent is None else _named_joint(group)))
     return records
 
 
@@ -427,6 +427,14 @@ def _can_merge(group: _Group, child: _Group) -> bool:
         group.joints[0].slides or child.joints[0].slides
     )
     return is_hinge_pair and float(np.abs(child.at).max()) <= COINCIDENCE_RTOL * float(np.abs(group.at).max())
+
+
+def _named_joint(group: _Group) -> Joint:
+    """Return the joint of a body; InputError with the name of the body if its joint cannot be used."""
+    try:
+        return _joint_of(group)
+    except InputError as error:
+        raise InputError(f"the joint of {group.name!r} cannot be used: {error}") from error
 
 
 def _joint_of(group: _Group) -> Joint:
@@ -443,7 +451,7 @@ def _joint_of(group: _Group) -> Joint:
         return Universal(group.at, axes, stiffness, damping, rests)
     kinds = " and ".join("slide" if joint.slides else "hinge" for joint in joints)
     raise InputError(
-        f"{group.name!r} has the joints {kinds} together, which is not covered: one hinge, one slide or two hinges are"
+        f"the joints {kinds} together are not covered. The combinations that are: one hinge, one slide, two hinges"
     )
 
 

@@ -294,6 +294,7 @@ HINGE = lt.bodies.Hinge((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
         ({"name": "bus", "mass": 1.0, "parent": "bus", "joint": HINGE}, "already"),
         ({"name": "arm", "mass": 0.0, "parent": "bus", "joint": HINGE}, "mass"),
         ({"name": "arm", "mass": 1.0, "parent": "leg", "joint": HINGE}, "unknown"),
+        ({"name": "arm", "mass": 1.0, "parent": "arm", "joint": HINGE}, "'arm' is unknown.*without loops"),
         ({"name": "arm", "mass": 1.0, "parent": "bus"}, "joint"),
         (
             {"name": "arm", "mass": 1.0, "parent": "bus", "joint": HINGE, "inertia": np.triu(np.ones((3, 3)))},
@@ -309,9 +310,22 @@ def test_bodies_that_cannot_be_added(arguments, match):
         tree.add(**arguments)
 
 
+@pytest.mark.parametrize(
+    ("make_joint", "match"),
+    [
+        (lambda: lt.bodies.Hinge((0, 0, 0), (0, 0, 0)), "axis of a hinge must be a direction"),
+        (lambda: lt.bodies.Slider((0, 0, 0), (0, 0, 0)), "axis of a slider must be a direction"),
+        (lambda: lt.bodies.Universal((0, 0, 0), ((0, 0, 0), (0, 1, 0))), "axis of a universal joint must be"),
+        (lambda: lt.bodies.Universal((0, 0, 0), ((0, 1, 0), (0, 2, 0))), "must not be parallel"),
+        (lambda: lt.bodies.Hinge((0, 0, 0), (0, 0, 1), damping=-1.0), "damping of a hinge must be finite and >= 0"),
+    ],
+)
+def test_joints_without_axes_or_with_negative_damping(make_joint, match):
+    with pytest.raises(lt.InputError, match=match):
+        make_joint()
+
+
 def test_other_bad_input(system):
-    with pytest.raises(lt.InputError, match="axis"):
-        lt.bodies.Hinge((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     with pytest.raises(lt.InputError, match="'antenna'"):
         system.state(joints={"antenna": 0.1})
     with pytest.raises(lt.InputError, match="gravity"):

@@ -104,6 +104,11 @@ def test_an_mjcf_file_is_the_tree_built_by_hand():
         (URDF.replace("<axis xyz", "<axis ixyz"), "needs the attribute 'xyz'"),
         (URDF.replace('<parent link="yoke"/>', '<parent link="arm"/>'), "the link 'arm'"),
         (URDF.replace("</robot>", ""), "not well-formed XML"),
+        (URDF.replace('<axis xyz="0 0 1"/>', '<axis xyz="0 0 0"/>'), "the joint of 'panel' cannot be used: the axis"),
+        (URDF.replace('damping="0.3"', 'damping="-0.3"'), "the joint of 'panel' cannot be used: damping"),
+        (URDF.replace('<joint name="fixed" type="fixed"><parent link="bus"/>',
+                      '<joint name="ring" type="continuous"><parent link="mass"/>'), "are in a loop of joints"),
+        (URDF.replace('iyy="0.4"', 'iyy="9"'), "no rigid body has the inertia of 'panel'"),
         ("<mujoco/>", "the root element 'robot'"),
     ],
 )  # fmt: skip
@@ -117,6 +122,9 @@ def test_urdf_that_is_not_covered_is_refused(text, message):
     [
         (MJCF.replace('type="hinge"', 'type="ball"'), "'ball', which is not covered"),
         (MJCF.replace("</mujoco>", "<equality/></mujoco>"), "the element 'equality' in mujoco"),
+        (MJCF.replace('axis="0 0 -1"', 'axis="0 0 0"'), "the joint of 'panel' cannot be used: the axis"),
+        (MJCF.replace('mass="2"', 'mass="0"'), "'panel' has an inertia and no mass"),
+        (MJCF.replace('diaginertia="3 2 1.5"', 'diaginertia="3 2 9"'), "no rigid body has the inertia of 'bus'"),
         (MJCF.replace('stiffness="4"', 'armature="4"'), "armature='4'"),
         (MJCF.replace('stiffness="4"', 'class="big"'), "the attribute 'class'"),
         (MJCF.replace("<worldbody>", '<worldbody><body name="other"/>'), "must be the only body"),
