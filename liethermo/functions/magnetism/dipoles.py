@@ -213,10 +213,14 @@ def lattice_kernel(lattice: Lattice, boundary: str) -> FourierKernel:
     if any(lattice.periodic):
         return _periodic_kernel(lattice, padded, boundary)
     atoms = len(lattice.basis)
-    r = _offsets(padded) @ lattice.vectors
+    offsets = _offsets(padded)
+    r = offsets @ lattice.vectors
+    # No two cells have these offsets. With zeros there, T(-r) = T(r) for all entries, so that the transform is real.
+    is_unused = (np.abs(offsets) >= lattice.cells).any(axis=-1)
     tensors = np.empty((len(COMPONENTS), atoms, atoms, *padded))
     for a, b in np.ndindex(atoms, atoms):
         tensors[:, a, b] = _six_components(dipole_tensor(r + lattice.basis[a] - lattice.basis[b]))
+    tensors[..., is_unused] = 0.0
     return FourierKernel.from_tensors(tensors, lattice.cells)
 
 

@@ -216,3 +216,11 @@ BAD = {
 
 
 test_bad_dipoles_are_refused = refusal_test(BAD, error=lt.LiethermoError)
+
+
+def test_open_lattices_of_one_atom_have_a_real_kernel():
+    """The dipolar tensor is even, so its transform is real; as a control, atoms of kagome are no pair of mirror
+    images in their cell."""
+    for name, cells, kind in (("sc", (6, 7, 8), "f"), ("square", (16, 20), "f"), ("kagome", (5, 5), "c")):
+        energy = mag.dipoles(mag.lattice(name, cells, periodic=False))
+        assert energy.kernel.transform.dtype.kind == kind

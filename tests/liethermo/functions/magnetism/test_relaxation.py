@@ -22,6 +22,20 @@ def test_a_grain_switches_at_the_field_of_stoner_and_wohlfarth(degrees):
     np.testing.assert_allclose(np.linalg.norm(loop.spins, axis=-1), 1.0, rtol=1e-14)
 
 
+def test_an_anisotropy_of_50_micro_ev_switches_at_its_field_in_tesla():
+    """A grain of 2.5 Bohr magnetons and 0.05 meV switches at ``2 K / mu`` = 0.691 T along its axis.
+
+    The field is from the constants 0.05788 meV / T and 0.05 meV, not from the units of the library.
+    """
+    mu = mag.units("meV").moment(2.5)
+    threshold = 2 * 0.05 / (2.5 * 0.0578838)
+    tilt = np.radians(1e-3)
+    expected = threshold * (np.cos(tilt) ** (2 / 3) + np.sin(tilt) ** (2 / 3)) ** -1.5
+    fields = np.array([0.999, 1.001])[:, None] * expected * np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
+    loop = mag.hysteresis_loop(mag.anisotropy(1, 0.05), [[0.0, 0.0, 1.0]], fields, mu)
+    assert loop.magnetisation[0, 2] > 0.0 > loop.magnetisation[1, 2]
+
+
 def test_a_spin_opposite_to_its_field_turns():
     loop = mag.hysteresis_loop(mag.anisotropy(1, 0.1), [[0.0, 0.0, 1.0]], [[0.0, 0.0, -1.0]])
     np.testing.assert_allclose(loop.magnetisation[0], [0.0, 0.0, -1.0], atol=1e-7)
