@@ -109,9 +109,12 @@ class TreeSystem(System):
         rates, first = self._motion(x).joint_rates, self.mechanism.first_joint_index
         return {name: _entries(rates, start - first, end - first) for name, start, end in self.joint_ranges}
 
-    def joint_rates_at(self, x):
+    @property
+    def velocity_functions(self):
+        if not self.joint_ranges:
+            return super().velocity_functions
         start, k = self.joint_ranges[0][1] + self.mechanism.n_joints, self.mechanism.n_joints
-        return self.energy.gradient(x)[start : start + k]
+        return super().velocity_functions | {"joint_rates": lambda x: self.energy.gradient(x)[start : start + k]}
 
     @with_library_settings
     def _motion(self, x) -> Motion:

@@ -55,7 +55,6 @@ from .solution_builder import (
     build_solution,
     series_of_functions,
     velocities_at_states,
-    velocity_names,
 )
 from .system_family import Family
 from .termination import ensemble_failure_message
@@ -232,7 +231,7 @@ class EnsembleRecord:
         """Return the functions that compute the velocities, trajectories first, by their names."""
         if self.x is None and self.trajectories is None:
             return {}
-        return {name: functools.partial(self._velocities, name) for name in velocity_names(self.member)}
+        return {name: functools.partial(self._velocities, name) for name in self.member.velocity_functions}
 
     def _velocities(self, name: str) -> np.ndarray:
         parts = [group.velocities(name) for group in self.groups]

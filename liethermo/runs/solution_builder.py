@@ -37,7 +37,7 @@ class RecordedFunctions(NamedTuple):
     has_user_states : bool
         Whether states of a run have the form that the user sees.
     velocity_names : tuple of str
-        Names in :data:`VELOCITY_FUNCTIONS` of the velocities that the system has.
+        Names of the velocities that the system has: see :attr:`liethermo.System.velocity_functions`.
     """
 
     invariants: dict[str, Energy]
@@ -50,7 +50,7 @@ class RecordedFunctions(NamedTuple):
         """Return the recorded functions, with invariants as :func:`.preparation.invariants_and_laws` returns them."""
         functions = {name: f for name, (f, _) in invariants.items()}
         has_user_states = type(system).to_user_solution is System.to_user_solution and not system.sites
-        return cls(functions, {**functions, **system.ledger}, has_user_states, velocity_names(system))
+        return cls(functions, {**functions, **system.ledger}, has_user_states, tuple(system.velocity_functions))
 
 
 def build_solution(
@@ -92,30 +92,16 @@ def build_solution(
     return solution if functions.has_user_states else system.to_user_solution(solution)
 
 
-def velocity_names(system: System) -> tuple[str, ...]:
-    """Return the names in :data:`VELOCITY_FUNCTIONS` of the velocities that a system has."""
-    has_velocity = {"angular_velocity": system.has_angular_velocity, "joint_rates": bool(system.joint_ranges)}
-    return tuple(name for name in VELOCITY_FUNCTIONS if has_velocity[name])
-
-
 def velocities_at_states(name: str, system: System, x: np.ndarray) -> np.ndarray:
     """Return the velocities of a name at states of a prepared system, shape (..., n); they have the shape (..., k)."""
     rows = np.asarray(x).reshape(-1, x.shape[-1])
-    return np.asarray(evaluate_at_points(VELOCITY_FUNCTIONS[name], system, rows)).reshape(*x.shape[:-1], -1)
+    return np.asarray(evaluate_at_points(_velocities, system, rows)[name]).reshape(*x.shape[:-1], -1)
 
 
-def _angular_velocity(system: System, x):
-    return system.angular_velocity_at(x)
+def _velocities(system: System, x) -> dict[str, Any]:
+    return {name: velocity(x) for name, velocity in system.velocity_functions.items()}
 
 
-def _joint_rates(system: System, x):
-    return system.joint_rates_at(x)
-
-
-VELOCITY_FUNCTIONS: dict[str, Callable[[System, Any], Any]] = {
-    "angular_velocity": _angular_velocity,
-    "joint_rates": _joint_rates,
-}
 """Functions of a system and a state, shape (n,), to velocities, shape (k,), by the name of the result."""
 
 

@@ -150,11 +150,8 @@ class EulerPoincareClosedSystem(LedgerSystem):
         return cast(VelocityLiePoisson, self.structure).momentum_derivatives(x[: self.dim_without_ledger])[1:]
 
     @property
-    def has_angular_velocity(self) -> bool:
-        return begins_with_rotations(self.algebra)
-
-    def angular_velocity_at(self, x):
-        return x[:3]
+    def velocity_functions(self):
+        return {"angular_velocity": lambda x: x[:3]} if begins_with_rotations(self.algebra) else {}
 
     def temperature_at(self, y) -> jax.Array:
         return -jax.grad(self.lagrangian, argnums=1)(y[:-1], y[-1])

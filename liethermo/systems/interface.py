@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import ClassVar, NamedTuple, Self
 
 import equinox as eqx
@@ -13,7 +13,6 @@ import scipy
 
 from ..dissipation.base import Dissipation, LawName
 from ..dissipation.geometry import Geometry
-from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.surface import Surface
 from .baths import HeatBaths
@@ -100,17 +99,13 @@ class SystemInterface(Geometry):
         return ()
 
     @property
-    def has_angular_velocity(self) -> bool:
-        """True if the system contains a rigid body, whose angular velocity :meth:`angular_velocity_at` returns."""
-        return False
+    def velocity_functions(self) -> dict[str, Callable]:
+        """Functions of a state, shape (n,), to velocities that a solution shows, shape (k,), by name.
 
-    def angular_velocity_at(self, x) -> jax.Array:
-        """Return the angular velocity of the rigid body in body axes, shape (3,), at a state x, shape (n,)."""
-        raise InputError("the system contains no rigid body, so it has no angular velocity")
-
-    def joint_rates_at(self, x) -> jax.Array:
-        """Return the rates of the joint coordinates, shape (k,), in the order of :attr:`joint_ranges`, at a state x."""
-        raise InputError("the system is not a tree of jointed bodies, so it has no joint rates")
+        They are ``angular_velocity`` of a rigid body, in body axes, and ``joint_rates`` in the order of
+        :attr:`joint_ranges`.
+        """
+        return {}
 
     @property
     def inner(self) -> SystemInterface | None:

@@ -160,11 +160,10 @@ class LiePoissonSystem(TorqueSystem):
         return _inertia_tensor(energy, self.algebra.dim) if energy.is_quadratic else None
 
     @property
-    def has_angular_velocity(self) -> bool:
-        return begins_with_rotations(self.algebra)
-
-    def angular_velocity_at(self, x):
-        return self.energy.gradient(x)[:3]
+    def velocity_functions(self):
+        if not begins_with_rotations(self.algebra):
+            return {}
+        return {"angular_velocity": lambda x: self.energy.gradient(x)[:3]}
 
     def state(
         self, x=None, batch: bool = False, *, angular_velocity=None, rotor_rates=None, temperature=None, t=None

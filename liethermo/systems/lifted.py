@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -70,11 +71,12 @@ class LiftedSystem(System):
     def domain_margin(self, x):
         return self.inner_at(x).domain_margin(x[..., : self.inner.dim])
 
-    def angular_velocity_at(self, x):
-        return self.inner_at(x).angular_velocity_at(x[: self.inner.dim])
+    @property
+    def velocity_functions(self):
+        def velocity(name: str, x):
+            return self.inner_at(x).velocity_functions[name](x[: self.inner.dim])
 
-    def joint_rates_at(self, x):
-        return self.inner_at(x).joint_rates_at(x[: self.inner.dim])
+        return {name: partial(velocity, name) for name in self.inner.velocity_functions}
 
     def momentum_scale(self, x) -> jax.Array:
         return self.inner.momentum_scale(x[: self.inner.dim])
@@ -88,7 +90,6 @@ class LiftedSystem(System):
     torque_invariant_casimirs = forward_to("inner")
     has_all_casimirs = forward_to("inner")
     orbit_levels = forward_to("inner")
-    has_angular_velocity = forward_to("inner")
     joint_ranges = forward_to("inner")
     surface = forward_to("inner")
 
