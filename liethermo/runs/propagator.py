@@ -291,7 +291,7 @@ class Propagator:
     def _schedule(
         self, t_span, save_every: int, save_at, allow_infinite_end: bool, breaks, declared: DeclaredTimes
     ) -> StepSchedule:
-        """Return the schedule of a run; short schedules are cached, and those used last are kept."""
+        """Return the schedule of a run; short schedules that were used recently are cached."""
         if save_at is not None or allow_infinite_end or np.size(breaks) or any(declared) or type(save_every) is not int:
             return make_schedule(t_span, self.step, save_every, save_at, allow_infinite_end, breaks, declared)
         key = *checked_span(t_span), save_every
@@ -387,7 +387,7 @@ class Propagator:
 
 
 def _leave_to_run(x0) -> None:
-    """Return None: a run has to compute the last state."""
+    """Return None, which says that no machine code computes the last state and a run has to."""
 
 
 class _ThreadFunctions(threading.local):
