@@ -84,13 +84,13 @@ def with_library_settings(function: F) -> F:
     """Decorate a public function so that it runs under :func:`library_settings`."""
 
     @functools.wraps(function)
-    def called(*args, **kwargs):
+    def call_with_settings(*args, **kwargs):
         if _checked_settings() == LIBRARY_SETTINGS:  # the usual case, without the cost of a context manager
             return function(*args, **kwargs)
         with library_settings():
             return function(*args, **kwargs)
 
-    return cast("F", called)
+    return cast("F", call_with_settings)
 
 
 @contextlib.contextmanager

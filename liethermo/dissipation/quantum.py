@@ -312,7 +312,7 @@ class ThermalJumps(Dissipation):
         return jnp.concatenate([force, np.eye(system.dim - n)[self.bath] * entropy_rate])
 
     def _energy_rate(self, structure: mf.DensityMatrices, dH, drho, force) -> jax.Array:
-        """Return ``tr(H drho)``, shape (), for drho of trace zero in the frame, and its coordinates ``force``.
+        """Return ``tr(H drho)``, shape (), for drho of trace zero in the jump frame, with coordinates ``force``.
 
         It is summed by parts, from differences of neighbouring levels and the populations that cross between them. So
         levels that no jump connects do not matter, however large their energies are.

@@ -324,7 +324,7 @@ class PauseHandler:
             runs.write("steps_at_last_stop", indices[resumes], (runs.read("step", indices) - n_done)[resumes])
 
     def _has_changed_sign(self, values_before: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return which functions have changed their sign at a pause, shape (trajectories, functions).
+        """Return whether each event function has changed its sign at a pause, shape (trajectories, functions).
 
         At least one has: the one that is nearest to its zero may still have the sign before.
         """

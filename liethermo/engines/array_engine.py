@@ -90,7 +90,7 @@ class LazyNewton:
         self.has_newton = not isinstance(method, OneStepMethod) or method.explicit
 
     def advance(self, call: Callable, state: State, save_every) -> tuple[State, tuple]:
-        """Return the state and the saved arrays after ``call(state, with_newton, first_step)``."""
+        """Return ``call(state, with_newton, first_step)``, with Newton's method once a step needs it."""
         first_step = state.step
         state, saved = call(state, self.has_newton, first_step)
         needs_newton = np.isin(state.status, FAILED_STEP_CODES)
@@ -103,7 +103,7 @@ class LazyNewton:
         return state, tuple(jnp.where(mask, a, b) for mask, a, b in zip(masks, saved, saved_later, strict=True))
 
     def advance_adaptive(self, call: Callable, adaptive_state):
-        """Return the adaptive state after ``call(adaptive_state, with_newton)``, of one trajectory or many."""
+        """Return ``call(adaptive_state, with_newton)``, with Newton's method once a step needs it."""
         adaptive_state = call(adaptive_state, self.has_newton)
         if self.has_newton or not np.isin(adaptive_state.last_attempt_status, FAILED_STEP_CODES).any():
             return adaptive_state

@@ -42,24 +42,24 @@ EMPTY_BRACKET = RootBracket(*np.zeros(len(RootBracket._fields)))
 """Bracket without a root."""
 
 
-def search_shape(event_shape: tuple[int]) -> tuple[int]:
-    """Return the shape of :func:`search_array`."""
+def search_array_shape(event_shape: tuple[int]) -> tuple[int]:
+    """Return the shape of the array that :func:`search_array` makes for event values of ``event_shape``."""
     return (len(RootBracket._fields) + event_shape[0],)
 
 
 def search_array(bracket: RootBracket, end_values) -> jax.Array:
-    """Return the fields of a bracket, followed by the event values where the search ended, in one array."""
+    """Pack the fields of a bracket, and the event values where the search ended, into one array."""
     return jnp.concatenate([jnp.stack([jnp.zeros(()) + value for value in bracket]), end_values])
 
 
 def split_search(array) -> tuple[RootBracket, Any]:
-    """Return the bracket and the event values where the search ended, from the array of both."""
+    """Unpack the bracket and the event values that :func:`search_array` has packed."""
     n_fields = len(RootBracket._fields)
     return RootBracket(*array[:n_fields]), array[n_fields:]
 
 
 def first_event_value(directions: tuple[int, ...], values_before, values) -> jax.Array:
-    """Return the function whose first zero in a step is the first event, from the event values at a point of the step.
+    """Return, at a point of a step, the value of one function whose first zero in the step is the first event.
 
     It is the only event function, or the minimum of them, each divided by its value at the start of the step. Functions
     that are zero or unknown there have no event in the step, nor have those whose events are in the other direction.

@@ -338,7 +338,7 @@ since :func:`drift_correction_multiplier` removes it. With half of this spacing 
 
 
 def round_to_nearest_level(value, sensitivity) -> jax.Array:
-    """Return the multiple of 16 to 32 roundings of a function with this sensitivity that is nearest to ``value``.
+    """Return ``value`` rounded to a multiple of 16 to 32 rounding errors of a function with this sensitivity.
 
     A run that knows only its present state is held on these levels: a value near a level stays there.
     """
@@ -380,5 +380,5 @@ def rounding_sensitivities(system: System, x) -> tuple[jax.Array, jax.Array]:
 
 
 def energy_or_entropy_that_relaxes(system: System, energy, entropy):
-    """Return the value whose approach to equilibrium is timed: the energy under a double bracket, else the entropy."""
+    """Return the one of two values that relaxes to equilibrium: the energy under a double bracket, else the entropy."""
     return energy if system.energy_law == "nonincreasing" else entropy

@@ -172,13 +172,13 @@ def initial_adaptive_state(
         max_relative_rate=relative_rate,
         growth_rate=zero,
         jacobian_probe=jnp.full_like(probe, jnp.nan),
-        root_bracket=jnp.zeros(root_bracket.search_shape(control.event_shape)),
+        root_bracket=jnp.zeros(root_bracket.search_array_shape(control.event_shape)),
     )
     return limit_next_step_by_growth_rate(method, adaptive_state, probe) if control.adaptive else adaptive_state
 
 
 def jacobian_probe_shape(system: System, method: OneStepMethod, control: StepControl) -> tuple[int, ...]:
-    """Return the shape of the field ``jacobian_probe`` of an adaptive state; (1, 1) for fixed steps."""
+    """Return the shape of the field ``jacobian_probe`` of an adaptive state; (1, 1) if the steps are fixed."""
     if not control.adaptive:
         return 1, 1
     x = jax.ShapeDtypeStruct((system.dim,), jnp.float64)

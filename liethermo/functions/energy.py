@@ -162,7 +162,7 @@ class Energy(Module):
         return self.map_terms(lambda term: Pullback(term, coordinates))
 
     def map_terms(self, transform: Callable[[Energy], Energy]) -> Energy:
-        """Return the sum of ``change(term)`` over the terms, where ``transform`` maps a term to an energy."""
+        """Return the sum of ``transform(term)``, an energy, over the terms."""
         return Sum.of([transform(term) for term in self.terms])
 
     @property

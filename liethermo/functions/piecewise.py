@@ -259,7 +259,7 @@ def _pieces_of_spline(spline: Any) -> tuple[jax.Array, jax.Array]:
 
 
 def _bspline_on_its_interval(spline: Any) -> Any:
-    """Return the polynomials of a B-spline between its first and its last knot that counts."""
+    """Return a B-spline of degree k as piecewise polynomials, from its knot k to the last knot but k."""
     start, end = spline.t[spline.k], spline.t[-spline.k - 1]
     breakpoints = np.unique(spline.t[(spline.t >= start) & (spline.t <= end)])
     derivatives = [spline.derivative(j) if j else spline for j in range(spline.k + 1)]

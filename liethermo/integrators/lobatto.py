@@ -89,7 +89,7 @@ def lobatto_tableau(order: int) -> ExplicitTableau:
 
 
 def _error_estimate(A: np.ndarray, b: np.ndarray, order: int, tree_vectors: list[np.ndarray]) -> ErrorEstimate:
-    """Return the error estimate that is right for equations whose step has only the rooted trees of some vectors.
+    """Return the error estimate that is exact for equations whose steps contain only the given rooted trees.
 
     ``tree_vectors[q]`` is the stage vector of the tree with q + 1 nodes. The weights vanish on all rooted trees of at
     most q nodes, with the largest possible q.

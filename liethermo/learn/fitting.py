@@ -233,7 +233,7 @@ def fit(
         )
     default_fraction = 0.2 if observation.is_full_state and matching + shooting else 0.0
     held_out_fraction = default_fraction if validation is None else validation
-    training_data, held_out_data = _split_held_out(
+    training_data, held_out_data = _split_training_and_held_out(
         list(zip(trajectories, starts, strict=True)), held_out_fraction, seed
     )
 
@@ -478,7 +478,7 @@ def checked_noise(noise: float | str | Sequence[float | str] | None, count: int)
     return np.broadcast_to(sigma, (count,)).copy()
 
 
-def _split_held_out(data: list, held_out_fraction: float, seed: int) -> tuple[list, list]:
+def _split_training_and_held_out(data: list, held_out_fraction: float, seed: int) -> tuple[list, list]:
     """Split data into a training set and a held-out set: whole trajectories, or the end of the only one."""
     if not (_is_real_number(held_out_fraction) and 0.0 <= held_out_fraction < 1.0):
         raise InputError(f"validation must be a fraction from 0 to below 1, got {held_out_fraction!r}")

@@ -198,7 +198,7 @@ def _pieces_of_length(runs: PaddedRuns, length: int) -> list[Piece]:
 
 
 def _residual_to_noise(residuals: np.ndarray, levels: NoiseLevels, counts: np.ndarray) -> float:
-    """Return residuals relative to the noise that differences of the data show; 1 if they show nothing against it.
+    """Return the root mean square of residuals over the noise estimated from the data; 1 if there is no estimate.
 
     Where the differences show no noise but bound it, residuals below the bound count as noise.
     """

@@ -140,7 +140,7 @@ def make_observation(
 
     def function(x, attitude, t, parameters):
         values = {"x": x, "attitude": attitude, "t": t, "parameters": parameters}
-        return _as_array(observe(*(values[kind] for kind in kinds)))
+        return _to_array(observe(*(values[kind] for kind in kinds)))
 
     zero_state = jnp.zeros(system.dim), None if group is None else group.identity, jnp.zeros(())
     names: list[str] = []
@@ -150,7 +150,7 @@ def make_observation(
             parts = dict(zip(("x", "attitude", "t", "parameters"), arrays, strict=True))
             result = observe(*(parts[kind] for kind in kinds))
             names[:] = list(entry_names(result)) if isinstance(result, Mapping) else []
-            return _as_array(result)
+            return _to_array(result)
 
         output_shape = checked_result_shapes(evaluate, *zero_state, parameters)
     except IndexOutOfRangeError as error:
@@ -204,7 +204,7 @@ def _argument_kinds(observe: Any, has_parameters: bool) -> tuple[str, ...]:
     return tuple(result)
 
 
-def _as_array(result: Any) -> jax.Array:
+def _to_array(result: Any) -> jax.Array:
     """Return an observation as an array; a dict of observed numbers by name as the numbers in a row."""
     if isinstance(result, Mapping):
         return jnp.concatenate([jnp.ravel(jnp.asarray(value, dtype=jnp.float64)) for value in result.values()])

@@ -189,7 +189,7 @@ class _Labels:
         self.units = dict(units)
 
     def find(self, name: str, argument: str) -> str:
-        """Return the label of the column of a name, or of that label.
+        """Return the label of the column that has a name; a whole label is returned unchanged.
 
         Raises
         ------

@@ -99,9 +99,9 @@ def _order_by_field_change(system: System, x: np.ndarray, h: np.ndarray, max_sta
 
 
 def hermite_defect(field: Callable, steps: StepSample) -> np.ndarray:
-    """Return the defect of the cubic Hermite interpolant of each step relative to the field, shape (m,).
+    """Return how far the slope of each step's cubic Hermite interpolant is from the field, relative to it, shape (m,).
 
-    The defect is the mean over points inside the step, times the step size: about the local error of a method of order
+    This defect is the mean over points inside the step, times the step size: about the local error of a method of order
     three. It serves to rank steps. Points where the field is not finite do not decide.
 
     Parameters

@@ -127,7 +127,7 @@ class LaneParameters:
         return CompiledBatch(self.step_loop, self.first_lane_parameters, self.parameters(members, len(x)), x)
 
     def parameters(self, members: slice, n_members: int) -> np.ndarray:
-        """Return the parameters of members, shape (p,) if all have the same, or (n_members, p)."""
+        """Return the parameters that lanes read: of all members, shape (p,), if these agree, else (n_members, p)."""
         if not self.is_per_trajectory.any():
             return self.first_lane_parameters
         return np.hstack(

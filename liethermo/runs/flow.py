@@ -181,7 +181,7 @@ def flow(
 
 
 def _path_at_times(system_and_method, path, schedule: StepSchedule, times, compile_program: Callable) -> jax.Array:
-    """Compute states at given times from those at the ends of steps, by Newton's method where a step needs it."""
+    """Return states at given times, shape (times, n), from those at the ends of steps; by Newton's method if needed."""
     arguments = *system_and_method, path, schedule.saved_times, times
     span, program = (schedule.start, schedule.end), compile_program(_states_at_times)
     if system_and_method[1].explicit or is_traced(arguments):

@@ -54,7 +54,7 @@ class _StepFunction(eqx.Module):
     order: int = eqx.field(static=True)
 
     def unpack(self, z) -> tuple[Any, Any, jax.Array, jax.Array]:
-        """Return system, method, state and slopes from a row."""
+        """Return system, method, state and slopes from z, shape (n + q + m,): state, parameters and slopes."""
         leaves, structure = jax.tree_util.tree_flatten(self.system_method_state)
         *other_leaves, x = leaves
         _, unravel_parameters = ravel_pytree(
@@ -230,8 +230,8 @@ def _differentiated_parameters_and_state(
 
 
 def _symmetric_indices(p: int, rank: int) -> tuple[list[tuple[int, ...]], np.ndarray]:
-    """Return the distinct index sets of a symmetric tensor of a rank over p variables, and the set number of each
-    entry."""
+    """Return the distinct index sets of a symmetric tensor of rank ``rank`` over p variables, and for each entry of the
+    tensor the number of its set."""
     direction_sets = list(itertools.combinations_with_replacement(range(p), rank))
     entry_index = np.empty((p,) * rank, dtype=int)
     for i, directions in enumerate(direction_sets):

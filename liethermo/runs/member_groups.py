@@ -68,7 +68,7 @@ class InvariantFacts(NamedTuple):
 
 
 def attach_invariant_facts(system: System, facts: InvariantFacts) -> System:
-    """Return a copy of the system that has these facts as attributes."""
+    """Return a copy of the system with the facts on its invariants as attributes."""
     return replace_fields(system, **facts._asdict())
 
 
@@ -287,7 +287,7 @@ class _MemberFunctions:
     # -- evaluation ---------------------------------------------------------------------------------------------------
 
     def _evaluate_at(self, function: Callable, rows: np.ndarray, points: np.ndarray, *model) -> Any:
-        """Evaluate a function of members at points of each, shape (rows, points, n); both axes lead in the result."""
+        """Evaluate a function of members at points (rows, points, n); the result has shape (rows, points, ...)."""
         parameters = self.family.parameter_matrix(rows, len(rows))
         inputs = np.concatenate(
             [np.repeat(parameters, points.shape[1], axis=0), points.reshape(-1, points.shape[-1])], axis=1
@@ -325,7 +325,7 @@ class _MemberFunctions:
 
 
 def _member_and_state(form, p: int, row, time: int | None = None) -> tuple[System, jnp.ndarray]:
-    """Return the member and the state that a row holds; a driven member at its test time number ``time``."""
+    """Return member and state from a row of p parameters and a state; a driven member at test time number ``time``."""
     system = form.build(row[:p])
     return (system if time is None else systems_at_test_times(system)[time]), row[p:]
 

@@ -43,7 +43,7 @@ class NamedParameter(NamedTuple):
     is_inverse: bool = False
 
     def to_leaf(self, value):
-        """Return the entry of the arrays for a value of the parameter, or for several along the first axis.
+        """Convert a value of the parameter, or several along the first axis, to the array that the system stores.
 
         Parameters
         ----------
@@ -62,7 +62,7 @@ def named_parameters(system: System) -> dict[str, np.ndarray]:
     The names are those of the user's objects, whether or not the system has baths, a clock or an attitude. What is kept
     in several places, such as the capacity of a bath, is one parameter. A rigid body has ``energy.inertia``.
     """
-    return {name: parameter.value for name, parameter in _parameter_tables(system)[0].items()}
+    return {name: parameter.value for name, parameter in _parameters_by_name_and_by_path(system)[0].items()}
 
 
 def replace_parameters(system: System, values: Mapping[str, Any]) -> System:
@@ -88,7 +88,7 @@ def replace_parameters(system: System, values: Mapping[str, Any]) -> System:
 
 
 def arrays_with_members(system: System, values: Mapping[str, Any]) -> list[np.ndarray]:
-    """Return the arrays of a family of systems, members along the first axis, for given values of some parameters.
+    """Return the arrays of a family of systems (members along the first axis), with given values of some parameters.
 
     Arrays that all members share have a first axis of length 1.
 
@@ -111,7 +111,7 @@ def arrays_with_members(system: System, values: Mapping[str, Any]) -> list[np.nd
 
 
 def find_parameter(system: System, name: str) -> NamedParameter:
-    """Return the parameter that :func:`lookup_parameter` finds.
+    """Return the parameter that :func:`lookup_parameter` finds; raise InputError if there is none.
 
     Raises
     ------
@@ -130,7 +130,7 @@ def find_parameter(system: System, name: str) -> NamedParameter:
 
 def lookup_parameter(system: System, name: str) -> NamedParameter | None:
     """Return the parameter with a name, or with the path of one of its arrays in the system; None if there is none."""
-    by_name, by_path = _parameter_tables(system)
+    by_name, by_path = _parameters_by_name_and_by_path(system)
     return by_name.get(name) or by_path.get(name)
 
 
@@ -143,7 +143,7 @@ def _check_given_once(replaced: dict[int, str], name: str, parameter: NamedParam
 
 
 @memoize
-def _parameter_tables(system: System) -> tuple[dict[str, NamedParameter], dict[str, NamedParameter]]:
+def _parameters_by_name_and_by_path(system: System) -> tuple[dict[str, NamedParameter], dict[str, NamedParameter]]:
     """Return the parameters of a system by name, and by the paths of their arrays."""
     flat, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(system, eqx.is_inexact_array))
     fields = [[jax.tree_util.keystr((key,)).removeprefix(".") for key in path] for path, _ in flat]

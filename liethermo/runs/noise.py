@@ -268,7 +268,7 @@ class NoisePaths:
 
 
 def check_noise(noise, members: int = 1) -> None:
-    """Raise InputError unless ``noise`` is None, or Fluctuations with a seed for all or for each of the members."""
+    """Raise InputError unless ``noise`` is None, or Fluctuations with one seed for all members or one for each."""
     if noise is not None and not isinstance(noise, Fluctuations):
         raise InputError(f"noise must be lt.Fluctuations(boltzmann, seed), got {noise!r}")
     if noise is not None and len(noise.seeds) not in (1, members):

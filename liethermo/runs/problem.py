@@ -110,7 +110,7 @@ class Problem:
     def engine(
         self, requested_engine: str, system: System, planned_steps: int, noise_increments: Callable | None = None
     ) -> EngineWithFallback:
-        """Return the engine of a run in this thread: a shared one, or a new one if it serves one span or path.
+        """Return an engine for a run in this thread: a shared one, or a new one if it can serve one span or path only.
 
         Parameters
         ----------

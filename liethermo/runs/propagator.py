@@ -390,7 +390,7 @@ class Propagator:
 
 
 def _leave_to_run(x0) -> None:
-    """Return None: a run has to compute the last state."""
+    """Return None, which says that no machine code computes the last state and a run has to."""
 
 
 class _ThreadFunctions(threading.local):

@@ -552,7 +552,7 @@ class EnsembleEvidenceCollector:
         return (states[np.isfinite(states).all(axis=1)] for states in self.saved_states)
 
     def _rounding_scales(self, parameters: np.ndarray) -> dict[str, float]:
-        """Return the scales at which energy and entropy are rounded, each the largest of the sample."""
+        """Return the sizes that set the rounding errors of energy and entropy, each the largest over the sample."""
         rows = np.concatenate([parameters, self.x], axis=1)
         max_scales = evaluate_at_points(_rounding_scales_at, (self.family.form, parameters.shape[1]), rows).max(axis=0)
         return {

@@ -265,7 +265,7 @@ class Run:
     # -- the result ---------------------------------------------------------------------------------------------------
 
     def solution_so_far(self) -> Solution:
-        """Return the solution of the run so far."""
+        """Return the solution up to the last saved state."""
         x = np.concatenate(self.saved_states)
         energy, entropy = np.concatenate(self.saved_energies_entropies).T
         return build_solution(

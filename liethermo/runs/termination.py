@@ -264,7 +264,7 @@ def final_status(engine: EngineWithFallback, state, t: float, h: float, interrup
 
 
 def _step_size_advice(engine: EngineWithFallback, state, h: float) -> str:
-    """Try fractions of a failed step of size h; return the advice that follows."""
+    """Return advice on a failed step of size h, after trying shorter steps: a size that succeeds, or that none does."""
     state = state._replace(status=jnp.zeros_like(jnp.asarray(state.status)))
     for divisor in RETRY_DIVISORS:
         if int(engine.step(state, h / divisor).status) == StatusCode.COMPLETED:

@@ -359,7 +359,7 @@ def _attach_baths(system: System, baths: HeatBaths, bath_terms: tuple[Dissipatio
 
 
 def _drop_last_factor(space: mf.Space) -> mf.Space:
-    """A product without its last factor."""
+    """Return a product space without its last factor."""
     assert isinstance(space, mf.Product)
     first, *others = space.factors[:-1]
     return mf.Product(first, *others) if others else first

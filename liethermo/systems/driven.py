@@ -120,7 +120,7 @@ class DrivenSystem(LiftedSystem):
         return self.body.run_conditions(x[:, :-2], t, guarantees)
 
     def _body_at_first_time(self, x) -> System:
-        """Return the body at the time of the first of several states, given by numbers."""
+        """Return the body with its time frozen at that of the first of several states, which must not be traced."""
         t = float(np.reshape(x, (-1, self.dim))[0, -2]) / self.unit
         return self._body_at_time(min(max(t, float(self.span.start)), float(self.span.end)))
 

@@ -201,7 +201,7 @@ def _inside_indicator(surface: ConstraintSurface, x):
 
 
 def _tangency_residuals(system: System, x):
-    """Return how far a field is from tangent, and how much projecting it would change it, relative to the field.
+    """Return how much of a field is not tangent, and how much projecting changes it, relative to the field's norm.
 
     A field is tangent if it conserves the constraints and does not depend on normal components of covectors. The
     second value is separate, because off the manifold the projection need not be a projector.

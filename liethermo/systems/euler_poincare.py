@@ -42,11 +42,11 @@ class Legendre(Energy):
     lagrangian: Energy
 
     def velocity(self, mu) -> jax.Array:
-        """xi with ``dl/dxi = mu``, shape (n,); NaN where Newton's method finds none."""
+        """Return the velocity xi with ``dl/dxi = mu``, shape (n,); NaN where Newton's method finds none."""
         return inverse_gradient(self.lagrangian, jnp.asarray(mu))
 
     def momentum(self, xi) -> jax.Array:
-        """``dl/dxi``, shape (n,)."""
+        """Return the momentum ``dl/dxi``, shape (n,)."""
         return self.lagrangian.gradient(jnp.asarray(xi))
 
     def value(self, x) -> jax.Array:

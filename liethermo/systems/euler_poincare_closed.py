@@ -102,7 +102,7 @@ class EulerPoincareClosedSystem(LedgerSystem):
     def state(
         self, x=None, batch: bool = False, *, angular_velocity=None, rotor_rates=None, temperature=None
     ) -> jax.Array:
-        """Return ``x`` as a state of this system, or the state of a body with an angular velocity and a temperature.
+        """Return a state of this system: ``x``, checked, or the state with a given angular velocity and temperature.
 
         Parameters
         ----------

@@ -181,7 +181,7 @@ class ContactSystem(MomentumContactSystem):
 
 
 def canonical_structure(dim: int, space: mf.Space | None = None) -> mf.Cosymplectic:
-    """The structure of T*Q x R, on dim = 2n + 1 coordinates."""
+    """Return the contact structure of T*Q x R, on dim = 2n + 1 coordinates."""
     return mf.Cosymplectic(mf.CanonicalContact(n_degrees_of_freedom(dim), bundle=tangent_bundle_of(space)))
 
 

@@ -109,7 +109,7 @@ class SystemInterface(Geometry):
 
     @property
     def inner(self) -> SystemInterface | None:
-        """The system whose states begin those of this one, and whose functions are conserved; None without one."""
+        """The inner system, whose state is the first part of a state and whose laws hold here too; None without one."""
         return None
 
     # -- dynamics -----------------------------------------------------------------------------------------------------
@@ -328,7 +328,7 @@ class SystemInterface(Geometry):
 
     @property
     def hints(self) -> EngineHints:
-        """Return what an engine and a check may rely on; by default what the space tells."""
+        """Return the properties that engines and checks may rely on, by default those known from the space."""
         is_smooth = self.space is None or self.space.is_smooth
         is_complex = self.space is not None and self.space.dtype.kind == "c"
         return EngineHints(can_unroll=is_smooth and not is_complex, is_smooth=is_smooth)

@@ -168,7 +168,7 @@ class LiePoissonSystem(TorqueSystem):
     def state(
         self, x=None, batch: bool = False, *, angular_velocity=None, rotor_rates=None, temperature=None, t=None
     ) -> jax.Array:
-        """Return ``x`` as a state of this system, or the state of a rigid body with an angular velocity.
+        """Return a state of this system: ``x``, checked, or that of a rigid body with a given angular velocity.
 
         Parameters
         ----------

@@ -25,7 +25,7 @@ class LiftedSystem(System):
     @property
     @abstractmethod
     def inner(self) -> System:
-        """The system whose states begin those of this one."""
+        """The inner system, whose state is the first part of a state of this one."""
 
     def inner_at(self, x) -> System:
         """Return the inner system as it acts at a state, at its time and attitude."""

@@ -141,12 +141,12 @@ def frozen_system(system: System, t: float | None) -> System:
         return system
     if t is not None:
         return system.at_time(t)
-    if why := _why_not_autonomous(system):
+    if why := _explain_time_dependence(system):
         raise InputError(f"{why}, so it has no equilibrium. Give t= to freeze it at one time")
     return system.at_time(0.0)
 
 
-def _why_not_autonomous(system: System) -> str:
+def _explain_time_dependence(system: System) -> str:
     """Explain which part of a driven system changes with time; "" if none does at the test times."""
     points = system.samples(3)
     velocities = np.stack([evaluate_at_points(_velocity, s, points) for s in systems_at_test_times(system)])

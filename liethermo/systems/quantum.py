@@ -179,7 +179,7 @@ class QuantumSystem(System):
     # -- states -------------------------------------------------------------------------------------------------------
 
     def state(self, rho, batch: bool = False, entropies=None, mixed: float = 0.0) -> jax.Array:
-        """A state from a density matrix, shape (N, N), or a batch of them, shape (..., N, N).
+        """Return the state, shape (..., n), that has a density matrix, shape (N, N), or a batch of them (..., N, N).
 
         Parameters
         ----------
@@ -240,7 +240,7 @@ class QuantumSystem(System):
         return self.structure.matrix(x[..., : self.body_dim])
 
     def reduced(self, x, part: int | str) -> jax.Array:
-        """The density matrix of one part of a product, the others traced out, shape (..., N_k, N_k).
+        """Return the density matrix of one part of a product, the others traced out, shape (..., N_k, N_k).
 
         Parameters
         ----------
@@ -267,7 +267,7 @@ class QuantumSystem(System):
         return jnp.asarray(x)[..., : self.body_dim] @ self.structure.vector(observable)
 
     def bloch(self, x, part: int | str = 0) -> jax.Array:
-        """The Bloch vector ``tr(rho sigma)`` of a qubit, shape (..., n) to (..., 3).
+        """Return the Bloch vector ``tr(rho sigma)`` of a qubit, shape (..., n) to (..., 3).
 
         Parameters
         ----------
@@ -312,7 +312,7 @@ class QuantumSystem(System):
                 f"its density matrix has the eigenvalue {min_eigenvalue:.3g}, outside the cone of positive matrices: "
                 "a shorter step stays inside"
             )
-        return self._why_rank_grows(np.atleast_2d(x), rho) if self._has_dissipation(SteepestEntropyAscent) else ""
+        return self._explain_rank_growth(np.atleast_2d(x), rho) if self._has_dissipation(SteepestEntropyAscent) else ""
 
     def run_conditions(self, x, t, guarantees):
         rho = self._density_matrices(x)
@@ -332,7 +332,7 @@ class QuantumSystem(System):
             conditions.append(RunCondition(ADIABATIC_ROW, parameter, ADIABATIC_LIMIT, is_slow, note, True))
         return tuple(conditions)
 
-    def _why_rank_grows(self, x: np.ndarray, rho: np.ndarray) -> str:
+    def _explain_rank_growth(self, x: np.ndarray, rho: np.ndarray) -> str:
         """Explain why eigenvalues zero would not stay zero under steepest ascent; "" if they do."""
         kernels = self._kernels(rho)
         use = [i for i, kernel in enumerate(kernels) if kernel.size]

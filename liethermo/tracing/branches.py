@@ -45,7 +45,7 @@ class Branch(NamedTuple):
 
 
 def instructions_in_branches(program: Program, min_side_cost: int = MIN_BRANCH_COST) -> list[Instruction | Branch]:
-    """Return the instructions in order of evaluation, those that only one side of a branch needs inside it.
+    """Return the instructions in order of evaluation; those that only one side of a branch needs are moved into it.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def instructions_in_branches(program: Program, min_side_cost: int = MIN_BRANCH_C
     tests = {instruction.target for instruction in program.instructions if instruction.op == "branch"}
     if not tests:
         return list(program.instructions)
-    guards = _guards(program, tests)
+    guards = _guards_by_target(program, tests)
     costs = Counter[Guard]()
     for instruction in program.instructions:
         guard = guards[instruction.target]
@@ -71,8 +71,8 @@ def instructions_in_branches(program: Program, min_side_cost: int = MIN_BRANCH_C
     return _order_by_dependence(program.instructions, guards, 0)
 
 
-def _guards(program: Program, tests: set[str]) -> dict[str, Guard]:
-    """Return the guard of each instruction, by its target.
+def _guards_by_target(program: Program, tests: set[str]) -> dict[str, Guard]:
+    """Return the guard (the branches that enclose it) of each instruction, by the name that the instruction defines.
 
     All ``select`` instructions of a branch stand together, so each has the common prefix of their guards. This moves
     their arguments, and with these other choices; the pass is repeated until the guards no longer change.
@@ -99,7 +99,7 @@ def _guards(program: Program, tests: set[str]) -> dict[str, Guard]:
 
 
 def _common_prefix(a: Guard, b: Guard) -> Guard:
-    """Return the branches that two guards share."""
+    """Return the leading branches that two guards have in common."""
     depth = 0
     while depth < min(len(a), len(b)) and a[depth] == b[depth]:
         depth += 1

@@ -197,14 +197,14 @@ class EnclosingScope:
         self.tables: dict[str, tuple[Scalar, ...]] = {}
 
     def import_scalar(self, a: Scalar) -> str:
-        """Return the name that an outer scalar has inside."""
+        """Return the name by which the inner program reads a scalar of the outer one."""
         if a not in self.inner_names:
             self.inner_names[a] = name = f"x0_{len(self.inner_names)}"
             self.outer_scalars[name] = a
         return self.inner_names[a]
 
     def table(self, entries: Sequence[Scalar]) -> str:
-        """Make a table of these entries in the outer program; return its name inside."""
+        """Make a table of these entries in the outer program; return the name by which the inner program reads it."""
         name = self.import_scalar(self.builder.table([self.outer_scalars[a] if type(a) is str else a for a in entries]))
         self.tables[name] = tuple(entries)
         return name
@@ -218,7 +218,7 @@ MAX_TABLE_STRIDE = 256
 
 
 def restore_fixed_inputs(entries: Sequence[Scalar], fixed_inputs: Sequence[np.ndarray | None]) -> Sequence[Scalar]:
-    """Return the entries of a table with fixed inputs named again, if all are then equidistant in an input array.
+    """Return the entries of a table, numbers replaced by names of inputs if all then are equidistant in an input array.
 
     A table of that kind is read where the array lies, without a copy. An input that is fixed to a number has this
     number at run time too, so the names stand for equal values.
@@ -286,7 +286,7 @@ class Builder:
         return self
 
     def op(self, op: str | Block, *args: Scalar) -> Any:
-        """Return the result of an operation; only fold constants and merge equal expressions."""
+        """Return the scalar that an operation results in; constants are folded, and equal expressions merged."""
         if not any(type(a) is str for a in args):
             return evaluate_on_numbers(op, *args)
         if op in COMMUTATIVE:

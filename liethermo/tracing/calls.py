@@ -44,7 +44,7 @@ class LapackCall(Block):
 
     @property
     def result_specs(self) -> list[tuple[tuple[int, ...], bool]]:
-        """The shape of each result, and True if it is real even for complex arguments."""
+        """Return the shape of each result, and whether it is real even for complex arguments."""
         return LAPACK_FUNCTIONS[self.name].result_specs(*self.sizes)
 
     def entry_counts(self, specs) -> list[int]:

@@ -16,7 +16,7 @@ Index = tuple[int, ...]
 def _window_number_and_candidates(
     b, shape: Index, starts: Sequence[Scalar], sizes: Index
 ) -> tuple[Scalar, list[tuple]]:
-    """Return the run-time number of the window with these starts, and the windows that it counts.
+    """Return the number, known at run time, of the window with these starts, and the windows that it counts.
 
     A window that sticks out of the array is moved inside.
     """
@@ -42,7 +42,7 @@ def _candidate_windows(shape: Index, starts: Sequence[Scalar], sizes: Index) -> 
 
 
 def _is_window_inside(b, shape: Index, starts: Sequence[Scalar], sizes: Index) -> Scalar:
-    """Return the truth value that a window lies inside the array."""
+    """Return the scalar that is true if a window lies inside an array of this shape."""
     bounds = list(zip(starts, (n - m for n, m in zip(shape, sizes, strict=True)), strict=True))
     if not all(0 <= s <= last_start for s, last_start in bounds if not isinstance(s, str)):
         return False
@@ -66,7 +66,7 @@ def read_window(b, x: np.ndarray, starts: Sequence[Scalar], sizes: Index) -> np.
 
 
 def _read_real_window(b, x: np.ndarray, starts: Sequence[Scalar], sizes: Index) -> np.ndarray:
-    """Return the real entries in a window at run-time indices; what many reads of an array share is prepared once."""
+    """Return the real entries in a window at run-time indices, from tables that all reads of the array share."""
     window_number = _window_number(b, x.shape, starts, sizes)
     key = id(x), tuple(sizes), tuple(None if type(s) is str else int(s) for s in starts)
     if key not in b.prepared_windows:

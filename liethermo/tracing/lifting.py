@@ -35,7 +35,7 @@ class ConstantLifter:
         self.has_while_loop = False
 
     def lift_numbers(self, closed_jaxpr: ClosedJaxpr) -> tuple[Jaxpr, list, tuple]:
-        """Return the jaxpr, its remaining constants, and its numbers: all scalars in one array, then the arrays."""
+        """Return the jaxpr with its numbers as arguments, its other constants, and the numbers as arrays."""
         body = _LiftedBody(self)
         body.append_and_set_outputs(closed_jaxpr.jaxpr, closed_jaxpr.consts, closed_jaxpr.jaxpr.invars)
         used_vars = {a for eqn in body.equations for a in eqn.invars if type(a) is Var} | {
@@ -179,7 +179,7 @@ class _LiftedBody:
         return [self._lift_number(value, var.aval) for var, value in numbers]
 
     def _lift_branches(self, branches, inputs: list) -> tuple[tuple, list]:
-        """Return the branches of a ``cond``, each of which takes the numbers of all branches, and the inputs."""
+        """Return the branches of a ``cond``, each with the numbers of all branches as arguments, and the inputs."""
         lifted_branches = [self.lifter.lift_inner_jaxpr(branch) for branch in branches]
         number_vars = [var for _, numbers in lifted_branches for var, _ in numbers]
         outer_vars = [atom for _, numbers in lifted_branches for atom in self._lift_inner_numbers(numbers)]
@@ -240,7 +240,7 @@ def _expm_substitute(eqn: JaxprEqn) -> ClosedJaxpr | None:
 
 @functools.lru_cache(maxsize=64)
 def _expm_key_and_substitute(shape) -> tuple[Hashable, ClosedJaxpr | None]:
-    """Return a key of JAX's matrix exponential of an array and the jaxpr of the library's; None if no key is found."""
+    """Return a key that identifies JAX's ``expm`` for this shape, and the jaxpr of ours; None for both if not found."""
     outer = jax.make_jaxpr(jax.scipy.linalg.expm)(shape)
     expm_equations = [eqn for eqn in outer.eqns if eqn.params.get("name") == "expm"]
     if len(expm_equations) != 1:

@@ -47,7 +47,7 @@ def call_lapack(b, name: str, sizes: tuple[int, ...], *matrices: np.ndarray) -> 
 
 @functools.lru_cache(maxsize=256)
 def _cached_call(*spec) -> LapackCall:
-    """Return one object for equal calls, so that calls with equal arguments merge."""
+    """Return the LAPACK call of this specification, one object for equal ones, so that equal calls merge."""
     return LapackCall(*spec)
 
 
@@ -67,10 +67,10 @@ def matrix_product_by_loop(b, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def input_table_and_strides(b, x: np.ndarray) -> tuple[str, tuple[int, int]] | None:
-    """Return the table of a matrix, or of its transpose, that is an input of the program, without a copy.
+    """Return the name of the table, and the strides, of a matrix that is an input of the program or its transpose.
 
-    The result is the name of the table and the distances in it between neighbouring rows and between neighbouring
-    columns. It is None if the matrix is not an input.
+    The strides are the distances in the table between neighbouring rows and between neighbouring columns; nothing is
+    copied. The result is None if the matrix is not an input.
     """
     names = x.ravel().tolist()
     positions = b.input_positions_or_none(names)
@@ -232,7 +232,7 @@ def triangular_solve(b, eqn, a, rhs):
 
 
 def is_sorted_before(b, kind: str, x: Scalar, y: Scalar) -> Scalar:
-    """Return the truth value that x is sorted before y; NaN is sorted last."""
+    """Return the scalar that is true if x is sorted before y; NaN is sorted last."""
     is_less = b.op("lt", x, y)
     return is_less if kind != "f" else b.op("or", is_less, b.op("and", b.op("ne", y, y), b.op("eq", x, x)))
 

@@ -137,5 +137,5 @@ class _RoutineCall:
 
 
 def _convert_to_kind(b: Builder, kind: str, a: Scalar) -> Scalar:
-    """Convert a real number, as a routine passes it, back to its kind."""
+    """Convert a real number, the form in which routines pass values, to a kind: real, truth value or integer."""
     return a if kind == "f" else b.op("ne", a, 0.0) if kind == "b" else b.op("truncate", a)

@@ -193,7 +193,7 @@ def _refuse_primitive(b, eqn, *arguments):
 
 
 def _check_and_return_is_complex(eqn) -> bool:
-    """Refuse parameters and dtypes that the rules do not handle; return whether the equation has complex numbers."""
+    """Raise NotImplementedError for an equation that no rule handles; return whether it has complex numbers."""
     if eqn.primitive.name in UNROLLING_RULES:
         for name, value in eqn.params.items():
             if name not in SUPPORTED_PARAMETERS.split() and value is not None:
@@ -215,7 +215,7 @@ MOVE_PRIMITIVES = frozenset(
 
 
 def _round_to_dtype(b: Builder, eqn, results: list[np.ndarray]) -> list[np.ndarray]:
-    """Return the results as their dtypes hold them: float32 rounded, integers wrapped around."""
+    """Return the results of an equation as their dtypes hold them: float32 rounded, integers wrapped around."""
     name, rounded_results = eqn.primitive.name, []
     for var, result in zip(eqn.outvars, results, strict=True):
         dtype = var.aval.dtype
@@ -298,7 +298,7 @@ def _divided_difference_chain(b, eqn, *arguments):
 
 
 def _decompose_for_chain(function: chains.MatrixFunction, a):
-    """Decompose a matrix for the chains of a function."""
+    """Return the decomposition of a matrix that the divided differences of a function start from."""
     return function.decompose(a, unrolled=True)
 
 
@@ -329,7 +329,7 @@ def _unroll_linear_solve(b, eqn, *arguments):
 
 
 def _unroll_cond(b, eqn, branch_index, *arguments):
-    """Unroll every branch, which are pure functions, then select the results."""
+    """Unroll every branch of a ``cond`` (they are pure functions), and return the results of the selected one."""
     avals = [var.aval for var in eqn.outvars]
     branches = eqn.params["branches"]
     branch_index = branch_index.item()
@@ -360,7 +360,7 @@ class _LoopScope(EnclosingScope):
         return body_builder, _unroll_jaxpr(body_builder, closed_jaxpr.jaxpr, closed_jaxpr.consts, arguments)
 
     def outer_scalars_read(self, builders: Sequence[Builder], results: Sequence[Scalar]) -> dict[Scalar, str]:
-        """Return the names inside of the outer scalars that these instructions and results read, by outer scalar."""
+        """Return the inner names of the outer scalars that the instructions of a loop body read, by outer scalar."""
         names = {*results, *(a for b in builders for i in b.instructions for a in i.args)}
         return {a: name for a, name in self.inner_names.items() if name in names}
 
@@ -377,7 +377,7 @@ class _LoopCarry:
         return unflatten_scalars(iter(self.entries), self.avals)
 
     def release_changed_constants(self, results: Sequence[np.ndarray]) -> str:
-        """Make the constants that a pass has changed variables; return their kinds, "" if nothing has changed."""
+        """Turn constants of the carry that a pass changes into variables; return their kinds, "" if there are none."""
         changed_indices = [
             i
             for i, (a, new) in enumerate(zip(self.entries, flatten_scalars(results), strict=True))
@@ -406,7 +406,7 @@ class _LoopCarry:
 
 
 def _unroll_while_loop(b, eqn, *arguments):
-    """Build the block of a loop of unknown length."""
+    """Write a ``while`` loop as one block of the program; return its final carry as arrays of scalars."""
     params, avals = eqn.params, [var.aval for var in eqn.invars]
     n_test_constants, carry_start = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
     scope, carry = _LoopScope(b), _LoopCarry(arguments[carry_start:], avals[carry_start:])
@@ -465,7 +465,7 @@ loop does.
 
 
 def _unroll_scan(b, eqn, *arguments):
-    """Unroll a loop of known length, or build its block if it is long."""
+    """Unroll a ``scan``, or write it as one block if it is long; return its results as arrays of scalars."""
     params = eqn.params
     inner, n_consts, carry_end = params["jaxpr"], params["num_consts"], params["num_consts"] + params["num_carry"]
     if params["length"] > 2:
@@ -493,7 +493,7 @@ def _unroll_scan(b, eqn, *arguments):
 
 
 def _scan_as_loop_if_long(b, eqn, constants, carry_start, row_tables) -> list[np.ndarray] | None:
-    """Build the block of a loop of known length; return None if the loop is short enough to be unrolled."""
+    """Write a ``scan`` as one block and return its results; None if it is short enough to be unrolled."""
     length, closed_jaxpr, avals = eqn.params["length"], eqn.params["jaxpr"], [var.aval for var in eqn.invars]
     n_consts, carry_end = len(constants), len(constants) + len(carry_start)
     scope, carry = _LoopScope(b), _LoopCarry(carry_start, avals[n_consts:carry_end])

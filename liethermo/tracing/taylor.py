@@ -41,7 +41,7 @@ class TaylorSeriesError(InputError):
         super().__init__(f"{prefix}the JAX primitive {primitive!r} {reason} ({source_line}){suffix}")
 
     def add_context(self, subject: str, advice: str) -> TaylorSeriesError:
-        """Return the error with the name of the function in front and an advice behind."""
+        """Return a copy of the error whose message begins with the name of the function and ends with advice."""
         return type(self)(self.primitive, self.source_line, subject, f": {advice}")
 
 
@@ -195,13 +195,13 @@ class _Recurrences:
         return isinstance(value, _SeriesIndex) and self.terms[value.term_index].starts_at_zero
 
     def inline(self, function: Callable, values: Sequence) -> list:
-        """Return the results of a function, as a list, for arguments that are constants or series."""
+        """Add the terms of a function of constants and series; return its results, constants or series, as a list."""
         avals = [jax.ShapeDtypeStruct(np.shape(a), jnp.result_type(a)) for a in map(self.initial_value, values)]
         closed_jaxpr = jax.make_jaxpr(function)(*avals)
         return self.evaluate_jaxpr(closed_jaxpr.jaxpr, closed_jaxpr.consts, values)
 
     def evaluate_jaxpr(self, jaxpr, consts: Sequence, values: Sequence) -> list:
-        """Return the results of a jaxpr: series, or arrays if they do not depend on the argument."""
+        """Add the terms of a jaxpr; return its results, which are series, or arrays if constant."""
         env = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *values), strict=True))
 
         def read(v):
@@ -229,7 +229,7 @@ class _Recurrences:
 
 
 def _start_only_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """Return terms with an initial value but no recurrence; uses other than a test raise TaylorSeriesError."""
+    """Return placeholder terms without a recurrence, which only tests may read; other uses raise TaylorSeriesError."""
     return [
         recurrences.add_term(start, None, refusal=(eqn.primitive.name, user_source_line(eqn)))
         for start in _evaluate_equation(eqn, map(recurrences.initial_value, values))
@@ -237,7 +237,7 @@ def _start_only_rule(recurrences: _Recurrences, eqn, values) -> list:
 
 
 def _linear_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """Apply a primitive that is linear in all real arguments together; constants have no higher coefficients."""
+    """Return the series of a primitive that is linear in all real arguments together, coefficient by coefficient."""
     series_indices = [value.term_index for value in values if isinstance(value, _SeriesIndex)]
 
     def rule(n, n_float, current, history, output_number):
@@ -295,7 +295,7 @@ def _bilinear_rule(recurrences: _Recurrences, eqn, values) -> list:
 
 
 def _solve_bilinear(recurrences: _Recurrences, start, product: Callable, solve: Callable, a: _SeriesIndex, b) -> list:
-    """Solve ``product(a, c) = b`` for c, with a bilinear product; ``solve(rhs)`` solves it with coefficient 0 of a."""
+    """Return the series c with ``product(a, c) = b``; ``solve(rhs)`` solves this for coefficient 0 of a."""
     is_series, starts_at_zero = isinstance(b, _SeriesIndex), recurrences.starts_at_zero(b)
     current_terms = [*([b.term_index] if is_series else ()), *(() if starts_at_zero else (a.term_index,))]
 
@@ -322,7 +322,7 @@ def _division_rule(recurrences: _Recurrences, eqn, values) -> list:
 
 
 def _linear_solve_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """Apply ``custom_linear_solve``: its matrix is assembled from its products, its inverse is the user's ``solve``."""
+    """Return the series of ``custom_linear_solve``, whose matrix is assembled from its products with unit vectors."""
     lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
     constants, right_sides = list(values[: sum(lengths)]), values[sum(lengths) :]
     if len(right_sides) > 1:
@@ -351,7 +351,7 @@ def _linear_solve_rule(recurrences: _Recurrences, eqn, values) -> list:
 
 
 def _triangular_solve_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """Apply ``triangular_solve``, which reads one triangle of the matrix."""
+    """Return the series of ``triangular_solve``, which reads one triangle of the matrix."""
     a, b = values
     if not isinstance(a, _SeriesIndex):
         return _bilinear_rule(recurrences, eqn, values)
@@ -371,7 +371,7 @@ def _triangular_solve_rule(recurrences: _Recurrences, eqn, values) -> list:
 
 
 def _derivative_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """Compute ``y = F(a, b, ...)`` from ``D y = dF(D a, D b, ...)``, with JAX's rule for dF."""
+    """Return the series ``y = F(a, b, ...)`` of a smooth primitive, from ``D y = dF(D a, D b, ...)`` by JAX's rule."""
     (start,) = _evaluate_equation(eqn, map(recurrences.initial_value, values))
     key = (eqn.primitive.name, repr(eqn.params), tuple(value for value in values if isinstance(value, _SeriesIndex)))
     is_all_series = len(key[2]) == len(values)
@@ -398,7 +398,7 @@ def _derivative_rule(recurrences: _Recurrences, eqn, values) -> list:
 
 
 def _power_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """Compute ``a ** p``, by products for an integer p: ``p D a / a`` is inaccurate near a = 0, and NaN there."""
+    """Return the series ``a ** p``, by products for an integer p, since ``p D a / a`` is inaccurate near a = 0."""
     a, p = values
     if not isinstance(a, _SeriesIndex) or isinstance(p, _SeriesIndex):
         return _derivative_rule(recurrences, eqn, values)
@@ -482,7 +482,7 @@ def _call_rule(recurrences: _Recurrences, eqn, values) -> list:
 
 
 def _cond_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """Evaluate every branch of ``cond``, then select the branch that is chosen at the start."""
+    """Return the series of ``cond``: those of every branch, selected by the branch at the start."""
     branch_index, *values = values
     results = [recurrences.evaluate_jaxpr(branch.jaxpr, branch.consts, values) for branch in eqn.params["branches"]]
 
@@ -497,7 +497,7 @@ def _cond_rule(recurrences: _Recurrences, eqn, values) -> list:
 
 
 def _scan_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """Unroll ``scan``."""
+    """Return the series of a ``scan``, pass by pass."""
     params = eqn.params
     body, n_consts = params["jaxpr"], params["num_consts"]
     carry_end = n_consts + params["num_carry"]

@@ -80,7 +80,7 @@ def check_not_none(value, name: str) -> None:
 
 
 def check_precision(jaxpr: Jaxpr, name: str) -> None:
-    """Raise FunctionError if a function rounds a traced number to single precision.
+    """Raise FunctionError if the jaxpr of a function rounds double precision to single or less.
 
     Steps conserve the laws to the rounding of double precision, so no step with such a function could be solved.
     """

@@ -211,7 +211,7 @@ def is_library_object(function: Any) -> bool:
 
 
 def _check_indices_of(tree: Any, example_use: Callable, shapes: Sequence[tuple[int, ...]]) -> None:
-    """Check the constant indices in a user's object, if it can be traced; otherwise its later use reports the error."""
+    """Raise IndexOutOfRangeError if a user's object has a constant index out of range; skip what cannot be traced."""
     try:
         closed_jaxpr = jax.make_jaxpr(lambda *a: example_use(tree, *a))(
             *(jax.ShapeDtypeStruct(s, jnp.float64) for s in shapes)
@@ -310,7 +310,7 @@ class _CallRecorder:
 
     @property
     def traced_or_original_function(self) -> Callable:
-        """The traced function; the function itself if it was never called, or was called in more than one way."""
+        """Return the traced function, or the function itself if it was never called, or in more than one way."""
         return (
             next(iter(self._traced_functions.values()))
             if len(self._traced_functions) == 1 and not self._is_called_otherwise

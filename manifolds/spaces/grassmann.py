@@ -225,7 +225,7 @@ class Grassmann(Space):
         rotation = expm(_commutator(v, x))
         return symmetrize(rotation @ u @ rotation.swapaxes(-1, -2))
 
-    def _why_no_log(self, x, y):
+    def _explain_missing_log(self, x, y):
         return "the subspaces have a right angle between them, and more than one geodesic leads from x to y"
 
 

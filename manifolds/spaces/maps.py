@@ -300,7 +300,7 @@ class SpaceMaps(ABC):
     def _inverse_cayley(self, x, y):
         return self._group_exp(x, y)  # raises
 
-    def _why_no_log(self, x, y) -> str:
+    def _explain_missing_log(self, x, y) -> str:
         """Return the reason why ``log(x, y)`` is NaN, for one pair of NumPy arrays."""
         if not self.has_geodesics:
             return "the chart around x does not reach y; go by a point between them"

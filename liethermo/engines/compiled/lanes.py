@@ -30,7 +30,7 @@ class CompiledBatch:
     def advance(self, h, n_saves: int, steps_per_save: int, noise=None) -> np.ndarray:
         """Take ``n_saves * steps_per_save`` steps; return states, energies and entropies, shape (B, n_saves, n + 2)."""
         sizes = np.resize(h, len(self._blocks) * self._loop.lanes) if np.ndim(h) else h
-        saved = self._loop.run(self._first_parameters, self._blocks, sizes, n_saves, steps_per_save, noise)
+        saved = self._loop.advance_blocks(self._first_parameters, self._blocks, sizes, n_saves, steps_per_save, noise)
         return np.asarray(saved)[: self._n_trajectories]
 
     def read(self, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
@@ -64,7 +64,7 @@ class CompiledAdaptiveRuns:
         self.blocks = step_loop.start_blocks(parameters, x, 0, **initial_fields)
 
     def advance(self, max_attempts: int) -> None:
-        self.step_loop.run(self.first_parameters, self.blocks, 0.0, 1, max_attempts)
+        self.step_loop.advance_blocks(self.first_parameters, self.blocks, 0.0, 1, max_attempts)
 
     def state(self) -> State:
         return self.step_loop.state_from_block(self.blocks.copy())
@@ -73,7 +73,7 @@ class CompiledAdaptiveRuns:
         """Make up to ``max_attempts`` attempts of the only trajectory and return their records: see ATTEMPT_FIELDS."""
         n_before, out = self.read("n_attempts")[0], np.empty((1, max_attempts, self.step_loop.n_saved_values))
         try:
-            self.step_loop.run(self.first_parameters, self.blocks, 0.0, max_attempts, 1, out=out)
+            self.step_loop.advance_blocks(self.first_parameters, self.blocks, 0.0, max_attempts, 1, out=out)
         except UnsupportedPrimitive:
             if self.read("n_attempts")[0] == n_before:
                 raise

@@ -324,7 +324,7 @@ def _write_product_function(writer: Any, block: MatrixProduct, tables: Sequence[
 
 
 def _call_kernel(writer: Any, call: LapackCall, args: Sequence[ir.Value]) -> BlockResults:
-    """Call a LAPACK kernel lane by lane, so that the result of one does not depend on the others."""
+    """Call a LAPACK kernel lane by lane, so that the result in one lane does not depend on the others."""
     build, n_results = writer.builder, len(call.kinds)
     inputs = Table(writer, writer.double_type, [writer.cast(a, "f") for a in args])
     results = Table(writer, writer.double_type, length=n_results)

@@ -64,7 +64,7 @@ class ShortRun:
         self._address, self._run = self._fields.ctypes.data, RUN_SIGNATURE(_run_code().function_address("run"))
 
     def __call__(self, functions: tuple[Any, Any], newton_address: int) -> bool:
-        """Take the steps by the functions ``begin`` and ``advance``."""
+        """Take all steps by ``begin`` and ``advance``; return False if one fails or needs Newton's method."""
         if functions != self._functions:
             self._functions = functions
             self._fields[:2] = [ctypes.cast(function, ctypes.c_void_p).value or 0 for function in functions]

@@ -26,7 +26,7 @@ from ...tracing.caching import LRUCache
 from ...tracing.calls import deferred_p
 from ...tracing.scalarize import report_compiler_faults, scalarize
 from ..array_engine import max_saves_per_call
-from ..root_bracket import search_shape
+from ..root_bracket import search_array_shape
 from ..solver_options import DEFAULT_OPTIONS, SolverOptions
 from ..stage_solver import StageSolution, solve_newton
 from ..status_codes import StatusCode
@@ -140,13 +140,13 @@ class CompiledEngine:
 
     def step_ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
         blocks = self._step_loop.start_blocks(self._parameters, x)
-        self._step_loop.run(self._parameters, blocks, h, 1, 1)
+        self._step_loop.advance_blocks(self._parameters, blocks, h, 1, 1)
         fields = self._step_loop.read_fields(blocks, ("x", "status"))
         return np.where(fields["status"].reshape(-1, 1) == 0.0, fields["x"], np.nan)
 
     def _run(self, state: State, h, saves: int, save_every: int, noise) -> tuple[State, np.ndarray]:
         blocks = self._step_loop.block_from_state(state)
-        out = self._step_loop.run(
+        out = self._step_loop.advance_blocks(
             self._parameters, blocks, h, saves, save_every, None if noise is None else noise[None]
         )[0]
         return self._state_from_block(blocks), out
@@ -324,7 +324,7 @@ class CompiledStepLoop:
             self._shapes |= {
                 "jacobian_probe": jacobian_probe_shape(system, method, control),
                 "event_values": control.event_shape,
-                "root_bracket": search_shape(control.event_shape),
+                "root_bracket": search_array_shape(control.event_shape),
             }
         step_program = self._trace_program(
             self.fields_after_step, (*self.step_inputs, *self.field_names), self.field_names
@@ -521,32 +521,48 @@ class CompiledStepLoop:
             fields[name] = values.reshape(-1, n_lanes).T.reshape(n_lanes, *self.field_shape(name))
         return fields
 
-    def run(
-        self, parameters, blocks: np.ndarray, h: float | np.ndarray, saves: int, save_every: int, noise=None, out=None
+    def advance_blocks(
+        self,
+        parameters,
+        blocks: np.ndarray,
+        h: float | np.ndarray,
+        n_saves: int,
+        steps_per_save: int,
+        noise=None,
+        out=None,
     ) -> np.ndarray:
-        """Advance blocks in place by up to ``saves * save_every`` steps of size h; return the saved fields.
+        """Advance blocks in place by up to ``n_saves * steps_per_save`` steps of size h; return the saved fields.
 
         h is one step size, or one for each lane, empty lanes included. ``noise`` holds the increments of a stochastic
         method, shape (trajectories, steps, increments).
 
-        The result has shape (trajectories, saves, n_saved_values), including empty lanes, and is undefined after a
+        The result has shape (trajectories, n_saves, n_saved_values), including empty lanes, and is undefined after a
         failed step. It is written to ``out`` if that is given.
         """
         lanes, n_blocks, width = self.lanes, len(blocks), self.n_saved_values
         if "h" in self._layout.first_rows:
             self.block_rows(blocks, "h")[:, 0] = np.reshape(h, (-1, lanes)) if np.ndim(h) else h
         parameters = np.ascontiguousarray(parameters, dtype=np.float64)
-        out = np.empty((n_blocks, saves, width * lanes)) if out is None else out
+        out = np.empty((n_blocks, n_saves, width * lanes)) if out is None else out
         steps_done = np.zeros(n_blocks, dtype=np.int64)
-        saves, save_every = int(saves), int(save_every)
-        arguments = [parameters.ctypes.data, blocks.ctypes.data, steps_done.ctypes.data, n_blocks, saves, save_every]
-        increments = self.noise_by_block(noise, n_blocks, saves * save_every)
-        arguments += [out.ctypes.data, saves * save_every, increments.ctypes.data]
+        n_saves, steps_per_save = int(n_saves), int(steps_per_save)
+        arguments = [
+            parameters.ctypes.data,
+            blocks.ctypes.data,
+            steps_done.ctypes.data,
+            n_blocks,
+            n_saves,
+            steps_per_save,
+        ]
+        increments = self.noise_by_block(noise, n_blocks, n_saves * steps_per_save)
+        arguments += [out.ctypes.data, n_saves * steps_per_save, increments.ctypes.data]
         newton_address = self.newton_address(is_needed=False)
-        _, advance = self._loops.loop_functions(n_blocks * saves * save_every)
+        _, advance = self._loops.loop_functions(n_blocks * n_saves * steps_per_save)
         while advance(*arguments, newton_address) < n_blocks:
             newton_address = self.newton_address(is_needed=True)
-        return out.reshape(n_blocks, saves, width, lanes).transpose(0, 3, 1, 2).reshape(n_blocks * lanes, saves, width)
+        return (
+            out.reshape(n_blocks, n_saves, width, lanes).transpose(0, 3, 1, 2).reshape(n_blocks * lanes, n_saves, width)
+        )
 
     def saved_fields_of_one(self, out: np.ndarray) -> dict[str, np.ndarray]:
         """Return the saved fields of a single trajectory by name, from rows of ``out``."""

@@ -213,7 +213,7 @@ def _finish_step_program(system: System, method: OneStepMethod, state: State, h,
 
 
 def _weighted_residual_guess_and_scale(system: System, method: OneStepMethod, state: State, h):
-    """Return the residual ``w (slopes(k) - k)`` as a function of k, a guess of k, and the scale of updates.
+    """Return the function ``k -> w (slopes(k) - k)``, a guess of k, and the scale that updates are compared with.
 
     With the weights w of :meth:`liethermo.System.residual_weights` a stiff step is nearest to linear.
     """

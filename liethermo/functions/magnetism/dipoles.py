@@ -83,7 +83,7 @@ MAX_MATRIX_SITES = 16
 
 
 def kernel_energy(sites: tuple[int, ...], axes: int, kernel: FourierKernel, moments, strength) -> Energy:
-    """Return the pair energy that a kernel defines, computed by Fourier transforms or, for a few sites, by a matrix."""
+    """Return the energy of the pair interaction with a kernel, by Fourier transforms or, for a few sites, a matrix."""
     by_transforms = ConvolutionEnergy(sites, axes, kernel, moments, strength)
     count = math.prod(sites)
     if count > MAX_MATRIX_SITES:

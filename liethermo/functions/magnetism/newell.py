@@ -101,7 +101,7 @@ def _diagonal_function(x, y, z):
 
 
 def _mixed_function(x, y, z):
-    """Return g(x, y, z) of the closed form, odd in x and y and even in z [Newell, Williams & Dunlop 1993, eq. 32]."""
+    """Return Newell's function g(x, y, z), odd in x and y and even in z [Newell, Williams & Dunlop 1993, eq. 32]."""
     z = np.abs(z)
     r = np.sqrt(x * x + y * y + z * z)
     return (

@@ -118,7 +118,7 @@ def cubic_anisotropy(sites, first=1.0, second=0.0, axes=None) -> Energy:
 
 
 def stevens_anisotropy(sites, coefficients: Mapping, axes=None) -> Energy:
-    r"""Return a crystal field, ``sum_i sum B_kq O_kq(s_i)``, with the classical Stevens functions of rank 2, 4 and 6.
+    r"""Return the energy of a crystal field, ``sum_i sum B_kq O_kq(s_i)``, with Stevens functions of rank 2, 4 and 6.
 
     These are the leading powers of the operators in the spin, such as ``O_20 = 3 z^2 - r^2``,
     ``O_40 = 35 z^4 - 30 z^2 r^2 + 3 r^4`` and ``O_43 = z (x^3 - 3 x y^2)`` with r = \|s\|. For q < 0 the real part of

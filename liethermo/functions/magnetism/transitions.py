@@ -168,7 +168,7 @@ def _cumulant_slope(square, energy, temperature: float) -> float:
 
 
 def _jackknife_variance(quantity: Callable, series: np.ndarray) -> float:
-    """Return the jackknife variance of a function of a series, in blocks of several autocorrelation times."""
+    """Return the jackknife variance of a function of a series; each block left out is several autocorrelation times."""
     rows = np.arange(len(series))
     count = int(np.clip(len(rows) / (BLOCK_LENGTH * autocorrelation_time(series)), MIN_BLOCKS, MAX_BLOCKS))
     estimates = [quantity(np.delete(rows, block)) for block in np.array_split(rows, count)]

@@ -88,7 +88,7 @@ class Units(NamedTuple):
         return self.gamma(g) * checked_numbers(field, "a field") / (2.0 * jnp.pi)
 
     def gilbert(self, alpha, moment=None, g: float = ELECTRON_G_FACTOR) -> SpinDynamics:
-        """Return the parameters of Gilbert's form of the motion, ``s' = -gamma s x B + alpha s x s'``.
+        """Return the parameters of spins whose motion is Gilbert's, ``s' = -gamma s x B + alpha s x s'``.
 
         Here ``B = -grad H / mu``, so that ``ratio = gamma / (mu (1 + alpha^2))`` and ``rate = alpha ratio``.
 

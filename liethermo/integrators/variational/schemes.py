@@ -115,7 +115,7 @@ class VariationalIntegrator(OneStepMethod):
 
     @classmethod
     def midpoint(cls, alpha: float = 0.5, retraction: str | mf.Retraction | None = None) -> VariationalIntegrator:
-        """Return scheme 2, evaluated at a fraction alpha of the step: of order 2 for alpha = 1/2, else of order 1.
+        """Return the integrator that evaluates L at a fraction alpha of the step: of order 2 for alpha = 1/2, else 1.
 
         ``retraction`` has the curves on a manifold.
         """

@@ -125,7 +125,7 @@ class Copies(Module):
         return 0
 
     def energy_in_state(self, start: int) -> Energy:
-        """The energy as a function of a whole state in which the first of the bodies begins at a component."""
+        """Return the energy as a function of a whole state, in which the first body begins at index ``start``."""
         places = np.arange(start, start + self.count * self.dim).reshape(self.count, self.dim)
         return Each(self.energy, places, *self.parameters)
 
@@ -134,7 +134,7 @@ class Copies(Module):
 
 
 def name_subsystems(subsystems) -> tuple[tuple[str, ...], tuple[Subsystem | Copies, ...]]:
-    """A name for each entry, and the entries."""
+    """Return a name for each subsystem, and the subsystems; raise InputError if one is of another type."""
     if isinstance(subsystems, Mapping):
         names, bodies = tuple(map(str, subsystems)), tuple(subsystems.values())
     else:
