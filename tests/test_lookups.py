@@ -40,10 +40,6 @@ FOREIGN = {
 }
 
 OURS = {
-    (
-        "liethermo/integrators/base.py",
-        "retraction",
-    ): "a field of some methods; a class cannot declare it for all of them",
     ("liethermo/learn/files.py", "training"): "what a fit has put beside a system",
     (
         "liethermo/testing/transformations.py",

@@ -6,7 +6,7 @@ import enum
 import functools
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import equinox as eqx
 import jax
@@ -73,9 +73,11 @@ class OneStepMethod(Module):
 
     systems: ClassVar[str] = EVERY_SYSTEM
     why_fixed_step: ClassVar[str] = "it does not estimate the error of its steps"
+    retraction = cast("str | mf.Retraction | None", None)
+    """Charts that the method takes its steps in, by name or as an object; a field of methods that can use them."""
 
     def __check_init__(self):
-        retraction = getattr(self, "retraction", None)
+        retraction = self.retraction
         if not isinstance(retraction, mf.Retraction | None) and retraction not in tuple(RETRACTIONS):
             names = ", ".join(map(repr, RETRACTIONS))
             raise InputError(f"retraction must be a manifolds.Retraction or one of {names}, got {retraction!r}")
@@ -197,7 +199,7 @@ class OneStepMethod(Module):
     @property
     def uses_charts(self) -> bool:
         """True if the method runs on a manifold in the charts of a retraction, and not in the space around it."""
-        return getattr(self, "retraction", None) is not None
+        return self.retraction is not None
 
     def __str__(self) -> str:
         return type(self).__name__
