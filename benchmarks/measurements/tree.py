@@ -52,7 +52,9 @@ def chain() -> lt.bodies.JointedBodies:
     for i in range(N_HINGES):
         hinge = lt.bodies.Hinge(at=HINGE_PLACE, axis=np.eye(3)[i % 3], stiffness=STIFFNESS)
         tree.add(f"link {i + 1}", 1.0, LINK_CENTRE, LINK_INERTIA, parent=f"link {i}", joint=hinge)
-    return tree.system()
+    system = tree.system()
+    assert isinstance(system, lt.bodies.JointedBodies)  # it has no ground
+    return system
 
 
 def library_row(step: float, t_end: float) -> list:
