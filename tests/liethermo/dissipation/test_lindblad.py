@@ -50,8 +50,8 @@ def test_a_damped_driven_qubit_obeys_the_optical_bloch_equations():
     )
     run = lt.integrate(qubit, qubit.state(RHO), (0.0, 10.0), 0.05, METHOD)
     r0 = np.asarray(qubit.bloch(qubit.state(RHO)))
-    expected = rest + scipy.linalg.expm(10.0 * M) @ (r0 - rest)
-    np.testing.assert_allclose(qubit.bloch(run.x[-1]), expected, atol=1e-9)
+    expected_values = rest + scipy.linalg.expm(10.0 * M) @ (r0 - rest)
+    np.testing.assert_allclose(qubit.bloch(run.x[-1]), expected_values, atol=1e-9)
 
 
 def test_the_motion_is_that_of_the_exponential_of_its_superoperator():
@@ -61,8 +61,8 @@ def test_the_motion_is_that_of_the_exponential_of_its_superoperator():
     rho = np.diag([0.5, 0.3, 0.2]).astype(complex)
     system = lt.QuantumSystem(FakeQobj(H), lt.LindbladJumps([(FakeQobj(V), rate) for V, rate in jumps]))
     run = lt.integrate(system, system.state(rho), (0.0, 2.0), 0.01, METHOD)
-    expected = (scipy.linalg.expm(2.0 * liouvillian(H, jumps)) @ rho.ravel()).reshape(3, 3)
-    np.testing.assert_allclose(system.density(run.x[-1]), expected, atol=1e-9)
+    expected_values = (scipy.linalg.expm(2.0 * liouvillian(H, jumps)) @ rho.ravel()).reshape(3, 3)
+    np.testing.assert_allclose(system.density(run.x[-1]), expected_values, atol=1e-9)
     audit = run.audit()
     assert audit.passed
     assert str(audit).count("no law promised") == 2
@@ -78,7 +78,7 @@ def test_a_drive_in_qutips_form_is_that_of_dop853():
     def field(t, v):
         return liouvillian(H0 + np.cos(omega * t) * H1, jumps) @ v
 
-    expected = scipy.integrate.solve_ivp(
+    expected_values = scipy.integrate.solve_ivp(
         field, (0.0, 5.0), RHO.ravel().astype(complex), method="DOP853", rtol=1e-12, atol=1e-13
     ).y[:, -1]
     dissipation = lt.LindbladJumps(jumps)
@@ -86,7 +86,7 @@ def test_a_drive_in_qutips_form_is_that_of_dop853():
     tabulated = lt.QuantumSystem([H0, [H1, np.cos(omega * times)]], dissipation, times=times)
     for system in (driven, tabulated):
         run = lt.integrate(system, system.state(RHO), (0.0, 5.0), 0.02, METHOD)
-        np.testing.assert_allclose(system.density(run.x[-1]).ravel(), expected, atol=1e-9)
+        np.testing.assert_allclose(system.density(run.x[-1]).ravel(), expected_values, atol=1e-9)
 
 
 def test_a_pure_state_does_not_lower_the_order():
@@ -96,11 +96,11 @@ def test_a_pure_state_does_not_lower_the_order():
     """
     drive = [-SZ, [0.6 * SX, lambda t: jnp.cos(1.7 * t)]]
     qubit = lt.QuantumSystem(drive, lt.LindbladJumps([(LOWER, 0.25)]))
-    expected = [0.48273702972652954, -0.4089103911923284, 0.13632498568856344]
+    expected_values = [0.48273702972652954, -0.4089103911923284, 0.13632498568856344]
     errors = []
     for step in (0.1, 0.05):
         run = lt.integrate(qubit, [1.0, 0.0], (0.0, 6.0), step, METHOD)
-        errors.append(np.abs(np.asarray(qubit.bloch(run.x[-1])) - expected).max())
+        errors.append(np.abs(np.asarray(qubit.bloch(run.x[-1])) - expected_values).max())
     assert errors[1] < 1e-9
     assert errors[0] / errors[1] > 2**5.5
 
@@ -110,8 +110,8 @@ def test_a_rate_that_depends_on_time_is_that_of_mesolve():
     rate = lambda t: 0.3 * (1.0 + 0.5 * jnp.sin(t))  # noqa: E731
     qubit = lt.QuantumSystem(-SZ + 0.3 * SX, lt.LindbladJumps([(LOWER, rate)]))
     run = lt.integrate(qubit, [1.0, 0.0], (0.0, 4.0), 0.05, METHOD)
-    expected = [-0.3410013963251303, -0.1323242925144413, 0.9287665574252146]
-    np.testing.assert_allclose(qubit.bloch(run.x[-1]), expected, atol=1e-9)
+    expected_values = [-0.3410013963251303, -0.1323242925144413, 0.9287665574252146]
+    np.testing.assert_allclose(qubit.bloch(run.x[-1]), expected_values, atol=1e-9)
 
 
 def test_rates_that_depend_on_time_are_those_of_dop853():
@@ -121,11 +121,11 @@ def test_rates_that_depend_on_time_are_those_of_dop853():
     def field(t, v):
         return liouvillian(H, [(LOWER, 0.2 * (1 + np.sin(t))), (SZ, 0.05)]) @ v
 
-    expected = scipy.integrate.solve_ivp(
+    expected_values = scipy.integrate.solve_ivp(
         field, (0.0, 4.0), RHO.ravel().astype(complex), method="DOP853", rtol=1e-12, atol=1e-13
     ).y[:, -1]
     run = lt.integrate(system, system.state(RHO), (0.0, 4.0), 0.02, METHOD)
-    np.testing.assert_allclose(system.density(run.x[-1]).ravel(), expected, atol=1e-9)
+    np.testing.assert_allclose(system.density(run.x[-1]).ravel(), expected_values, atol=1e-9)
     assert run.audit().passed
     velocity = np.asarray(system.structure.matrix(system.vector_field(system.state(RHO), 1.0)))
     np.testing.assert_allclose(velocity.ravel(), field(1.0, RHO.ravel()), atol=1e-14)

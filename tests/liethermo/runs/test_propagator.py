@@ -71,12 +71,12 @@ def test_final_state_equals_that_of_integrate(name, method):
     build, x0 = SYSTEMS[name]
     system = build()
     x0 = start_of(system, x0)
-    expected = lt.integrate(system, x0, SPAN, STEP, method)
+    expected_values = lt.integrate(system, x0, SPAN, STEP, method)
     propagator = lt.Propagator(system, method, STEP)
-    assert np.array_equal(propagator.final(x0, SPAN), expected.x[-1])
+    assert np.array_equal(propagator.final(x0, SPAN), expected_values.x[-1])
     solution = propagator(x0, SPAN)
-    assert np.array_equal(solution.x, expected.x)
-    assert np.array_equal(solution.t, expected.t)
+    assert np.array_equal(solution.x, expected_values.x)
+    assert np.array_equal(solution.t, expected_values.t)
     assert solution.audit().passed
 
 
@@ -91,8 +91,8 @@ def test_spans_that_end_between_steps(span):
 def test_adaptive_steps_and_options_of_a_call():
     body = rigid_body()
     propagator = lt.Propagator(body, lt.MetriplecticRungeKutta(8), lt.Adaptive(1e-8))
-    expected = lt.integrate(body, MU, (0.0, 9.0), lt.Adaptive(1e-8), lt.MetriplecticRungeKutta(8))
-    assert np.array_equal(propagator.final(MU, (0.0, 9.0)), expected.x[-1])
+    expected_values = lt.integrate(body, MU, (0.0, 9.0), lt.Adaptive(1e-8), lt.MetriplecticRungeKutta(8))
+    assert np.array_equal(propagator.final(MU, (0.0, 9.0)), expected_values.x[-1])
     saved = propagator(MU, (0.0, 9.0), save_at=[1.0, 2.0], dense=True)
     assert saved.t.tolist() == [0.0, 1.0, 2.0, 9.0]
     assert propagator(MU, (0.0, np.inf), until=lt.Relaxed(1e-6)).status.code == "event"
@@ -100,9 +100,9 @@ def test_adaptive_steps_and_options_of_a_call():
 
 def test_noise_is_that_of_integrate():
     body, noise = body_with_bath(), lt.Fluctuations(1e-3, seed=3)
-    expected = lt.integrate(body, MU, SPAN, STEP, noise=noise)
+    expected_values = lt.integrate(body, MU, SPAN, STEP, noise=noise)
     propagator = lt.Propagator(body, None, STEP, noise=noise)
-    assert np.array_equal(propagator.final(MU, SPAN), expected.x[-1])
+    assert np.array_equal(propagator.final(MU, SPAN), expected_values.x[-1])
 
 
 def test_many_is_an_ensemble():
@@ -116,11 +116,11 @@ def test_many_is_an_ensemble():
 def test_parameters_of_a_call():
     propagator = lt.Propagator(rigid_body(), lt.MetriplecticGauss(2), STEP)
     other = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.7)  # whose dissipation has half this rate
-    expected = lt.integrate(other, MU, SPAN, STEP, lt.MetriplecticGauss(2))
+    expected_values = lt.integrate(other, MU, SPAN, STEP, lt.MetriplecticGauss(2))
     parameters = {"dissipation.rate": 0.35}
-    assert np.array_equal(propagator.final(MU, SPAN, parameters=parameters), expected.x[-1])
-    assert np.array_equal(propagator(MU, SPAN, parameters=parameters).x, expected.x)
-    assert not np.array_equal(propagator.final(MU, SPAN), expected.x[-1])
+    assert np.array_equal(propagator.final(MU, SPAN, parameters=parameters), expected_values.x[-1])
+    assert np.array_equal(propagator(MU, SPAN, parameters=parameters).x, expected_values.x)
+    assert not np.array_equal(propagator.final(MU, SPAN), expected_values.x[-1])
     with pytest.raises(lt.InputError, match=r"no parameter 'rate'; its parameters are .*dissipation\.rate"):
         propagator.final(MU, SPAN, parameters={"rate": 0.7})
     with pytest.raises(lt.InputError, match=r"dissipation\.rate must have shape \(\), got \(2,\)"):
@@ -134,18 +134,18 @@ def test_what_is_conserved_belongs_to_the_parameters_of_the_call():
     propagator = lt.Propagator(body, lt.MetriplecticRungeKutta(4), STEP)
     for A in ([1.0, 1.0, 1.0], [1.0, 0.5, 2.0]):
         other = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(A), body.entropy, lt.ProjectedMetric(rate=0.3))
-        expected = lt.integrate(other, MU, SPAN, STEP, lt.MetriplecticRungeKutta(4)).x[-1]
-        assert np.array_equal(propagator.final(MU, SPAN, parameters={"energy.A": A}), expected)
+        expected_values = lt.integrate(other, MU, SPAN, STEP, lt.MetriplecticRungeKutta(4)).x[-1]
+        assert np.array_equal(propagator.final(MU, SPAN, parameters={"energy.A": A}), expected_values)
 
 
 def test_threads_and_pickles():
     propagator = lt.Propagator(rigid_body(), lt.MetriplecticGauss(2), STEP)
     x0s = np.random.default_rng(0).standard_normal((40, 3))
-    expected = [propagator.final(x0, SPAN) for x0 in x0s]
+    expected_values = [propagator.final(x0, SPAN) for x0 in x0s]
     with ThreadPoolExecutor(4) as pool:
-        assert np.array_equal(list(pool.map(lambda x0: propagator.final(x0, SPAN), x0s)), expected)
+        assert np.array_equal(list(pool.map(lambda x0: propagator.final(x0, SPAN), x0s)), expected_values)
     again = pickle.loads(pickle.dumps(propagator))
-    assert np.array_equal([again.final(x0, SPAN) for x0 in x0s[:3]], expected[:3])
+    assert np.array_equal([again.final(x0, SPAN) for x0 in x0s[:3]], expected_values[:3])
     assert repr(again) == repr(propagator)
 
 
@@ -160,21 +160,21 @@ def test_a_result_is_not_overwritten_by_the_next_call():
 def test_steps_that_need_newton():
     body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=60.0)
     propagator = lt.Propagator(body, lt.MetriplecticGauss(1), 0.5)
-    expected = lt.integrate(body, MU, (0.0, 3.0), 0.5, lt.MetriplecticGauss(1))
-    assert expected.stats.newton_iterations > 0
-    assert np.array_equal(propagator.final(MU, (0.0, 3.0)), expected.x[-1])
-    assert np.array_equal(propagator.final(MU, (0.0, 3.0)), expected.x[-1])
+    expected_values = lt.integrate(body, MU, (0.0, 3.0), 0.5, lt.MetriplecticGauss(1))
+    assert expected_values.stats.newton_iterations > 0
+    assert np.array_equal(propagator.final(MU, (0.0, 3.0)), expected_values.x[-1])
+    assert np.array_equal(propagator.final(MU, (0.0, 3.0)), expected_values.x[-1])
 
 
 def test_a_step_that_fails_raises_what_integrate_raises():
     body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=1e3)
     propagator = lt.Propagator(body, lt.MetriplecticRungeKutta(4), 5.0)
-    with pytest.raises(lt.NonFiniteError) as expected:
+    with pytest.raises(lt.NonFiniteError) as expected_values:
         lt.integrate(body, 9.0 * MU, (0.0, 50.0), 5.0, lt.MetriplecticRungeKutta(4))
     with pytest.raises(lt.NonFiniteError) as error:
         propagator.final(9.0 * MU, (0.0, 50.0))
-    assert str(error.value) == str(expected.value)
-    assert str(error.value.solution.status) == str(expected.value.solution.status)
+    assert str(error.value) == str(expected_values.value)
+    assert str(error.value.solution.status) == str(expected_values.value.solution.status)
 
 
 test_bad_arguments = refusal_test(

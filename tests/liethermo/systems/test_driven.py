@@ -244,19 +244,21 @@ def test_adaptive_steps_do_not_see_the_clock():
 
 def test_a_sweep_of_the_amplitude():
     amplitudes = np.linspace(0.0, 1.0, 5)
-    found = lt.ensemble(
+    found_values = lt.ensemble(
         pushed_spring, [1.0, 0.0], (0.7, 5.7), 0.05, parameters=amplitudes, outputs="trajectory", save_every=10
     )
-    assert found.ok.all()
-    assert found.x.shape == (5, 11, 2)
-    assert np.abs(found.x - [pushed_exactly(found.t, a) for a in amplitudes]).max() < 3e-3
-    assert np.abs(found.work[0]).max() == 0.0
-    assert np.abs(found.work[1:, -1]).min() > 0.01
-    expected = [pushed_spring(a).energy(x, found.t) for a, x in zip(amplitudes, found.x, strict=True)]
-    assert np.abs(found.energy - expected).max() < 1e-14
-    assert np.abs(found.energy - found.energy[:, :1] - found.work).max() < 1e-14
-    assert found.audit(energy=1e-12).passed
-    assert "energy minus work drift" in str(found.audit())
+    assert found_values.ok.all()
+    assert found_values.x.shape == (5, 11, 2)
+    assert np.abs(found_values.x - [pushed_exactly(found_values.t, a) for a in amplitudes]).max() < 3e-3
+    assert np.abs(found_values.work[0]).max() == 0.0
+    assert np.abs(found_values.work[1:, -1]).min() > 0.01
+    expected_values = [
+        pushed_spring(a).energy(x, found_values.t) for a, x in zip(amplitudes, found_values.x, strict=True)
+    ]
+    assert np.abs(found_values.energy - expected_values).max() < 1e-14
+    assert np.abs(found_values.energy - found_values.energy[:, :1] - found_values.work).max() < 1e-14
+    assert found_values.audit(energy=1e-12).passed
+    assert "energy minus work drift" in str(found_values.audit())
 
 
 @pytest.mark.slow
@@ -264,14 +266,16 @@ def test_a_sweep_of_the_amplitude():
 def test_a_sweep_by_the_name_of_the_parameter(engine):
     amplitudes = np.linspace(0.0, 1.0, 5)
     named = {"energy.summands[1].function.amplitude": amplitudes}
-    found = lt.ensemble(pushed_spring(9.0), [1.0, 0.0], (0.7, 5.7), 0.05, GAUSS[2], parameters=named, engine=engine)
-    assert np.abs(found.x - [pushed_exactly(5.7, a) for a in amplitudes]).max() < 1e-6
+    found_values = lt.ensemble(
+        pushed_spring(9.0), [1.0, 0.0], (0.7, 5.7), 0.05, GAUSS[2], parameters=named, engine=engine
+    )
+    assert np.abs(found_values.x - [pushed_exactly(5.7, a) for a in amplitudes]).max() < 1e-6
     short = lt.ensemble(
         pushed_spring(9.0), [1.0, 0.0], (0.7, 5.7), 0.05, GAUSS[2], parameters=named, engine=engine, outputs="summary"
     )
     assert short.x is None
-    assert np.array_equal(short.work, found.work)
-    assert np.array_equal(short.energy, found.energy)
+    assert np.array_equal(short.work, found_values.work)
+    assert np.array_equal(short.energy, found_values.energy)
 
 
 @pytest.mark.slow
@@ -291,11 +295,11 @@ def test_the_derivative_of_a_flow_by_the_amplitude():
 def test_what_the_user_sees():
     x, t = np.array([1.0, 0.2]), 0.9
     push = 0.4 * np.sin(RATE * t)
-    expected = [x[1] - push * x[0], push * x[1] - np.sin(x[0]) - 0.4 * x[0] ** 3]
-    assert np.allclose(SHAKEN.vector_field(x, t), expected, rtol=1e-14)
-    assert np.allclose(SHAKEN.at_time(t).vector_field(x), expected, rtol=1e-14)
+    expected_values = [x[1] - push * x[0], push * x[1] - np.sin(x[0]) - 0.4 * x[0] ** 3]
+    assert np.allclose(SHAKEN.vector_field(x, t), expected_values, rtol=1e-14)
+    assert np.allclose(SHAKEN.at_time(t).vector_field(x), expected_values, rtol=1e-14)
     times = np.array([0.0, t])
-    assert np.allclose(SHAKEN.vector_field(np.stack([x, x]), times)[1], expected, rtol=1e-14)
+    assert np.allclose(SHAKEN.vector_field(np.stack([x, x]), times)[1], expected_values, rtol=1e-14)
     assert np.allclose(SHAKEN.energy(x, times), [still(x), shaken(x, t)], rtol=1e-15)
     assert SHAKEN.is_driven
     assert not SHAKEN.at_time(t).is_driven
@@ -390,8 +394,8 @@ def test_an_euler_poincare_system_with_changing_inertia():
     assert np.allclose(by_velocity.velocity(mu, t), mu / growing_inertia(t), rtol=1e-14)
     assert np.allclose(by_velocity.momentum(mu / growing_inertia(t), t), mu, rtol=1e-14)
     fields = [DrivenSystem(s, unit=1.0) for s in (by_velocity, by_momentum)]
-    found = [s.vector_field(s.initial_state(mu, t)) for s in fields]
-    assert np.allclose(*found, rtol=1e-12, atol=1e-14)
+    found_values = [s.vector_field(s.initial_state(mu, t)) for s in fields]
+    assert np.allclose(*found_values, rtol=1e-12, atol=1e-14)
     assert not by_velocity.hints.can_unroll
 
 

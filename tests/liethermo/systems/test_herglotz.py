@@ -166,20 +166,20 @@ def thousand_steps() -> tuple[lt.Solution, np.ndarray]:
     solution = lt.integrate(recorder(), method.state(0.0, 1.0, 0.0, 0.1), (0.1, 100.1), 0.1, method, engine="array")
     h = gamma = np.longdouble("0.1")
     q0, q1, S0 = map(np.longdouble, (0, 1, 0))
-    expected = []
+    expected_values = []
     for _ in range(1001):
         S1 = S0 + (q1 - q0) ** 2 / h - h * (q1**2 - q0**2) / 4
         q2 = gamma * h**3 * (q0 + q1) + 4 * gamma * h * (q0 - q1) - h**2 * (q0 + 2 * q1) - 4 * q0 + 8 * q1
-        expected.append((q1, S1))
+        expected_values.append((q1, S1))
         q0, q1, S0 = q1, q2 / (h**2 + 4), S1
-    return solution, np.array(expected).astype(float)
+    return solution, np.array(expected_values).astype(float)
 
 
 @pytest.mark.slow
 def test_42():
     """The generic scheme (40)-(41) is (42): 1000 steps, against (42) in extended precision."""
-    solution, expected = thousand_steps()
-    assert (np.abs(solution.x[:, [0, 2]] - expected) <= 1e-14 * np.abs(expected).max(axis=0)).all()
+    solution, expected_values = thousand_steps()
+    assert (np.abs(solution.x[:, [0, 2]] - expected_values) <= 1e-14 * np.abs(expected_values).max(axis=0)).all()
     # what the paper says of Figs. 5 and 6: the Hamiltonian oscillates before it settles; but S falls at some steps
     early, late = solution.energy[:100], solution.energy[-100:]
     assert np.ptp(early) > 0.5

@@ -166,10 +166,10 @@ def test_the_compressed_jacobian_is_the_jacobian(method):
     assert compression.n_derivatives < 0.8 * k.size
     push = jax.jit(lambda seed: jax.jvp(slopes, (k,), (seed,))[1])
     pull = jax.jit(lambda seed: jax.vjp(slopes, k)[1](seed)[0])
-    found = compression.assemble_jacobian(push, pull)
+    found_values = compression.assemble_jacobian(push, pull)
     exact = np.asarray(jax.jacfwd(slopes)(k)).reshape(k.size, k.size)
     # rounding in derivatives of the quotient (H(x') - H(x)) / |d|^2: 6e-14 seen
-    assert np.abs(found.toarray() - exact).max() <= 3e-13 * np.abs(exact).max()
+    assert np.abs(found_values.toarray() - exact).max() <= 3e-13 * np.abs(exact).max()
     here = np.kron(np.ones((method.stages,) * 2, dtype=bool), pattern.toarray())
     assert not exact[~here].any()
     assert (exact != 0).sum() > 0.6 * here.sum()
@@ -286,8 +286,8 @@ def test_a_step_that_is_refused():
 def test_the_exact_heat_grid():
     """Against the exponential of the matrix; 3 by 4 nodes."""
     T = np.random.default_rng(0).uniform(200.0, 400.0, (3, 4))
-    expected = scipy.linalg.expm(-0.7 * 0.5 / 2.0 * grid_laplacian((3, 4)).toarray()) @ T.ravel()
-    assert np.allclose(heat_grid_solution(0.7, T, 2.0, 0.5).ravel(), expected, rtol=1e-14)
+    expected_values = scipy.linalg.expm(-0.7 * 0.5 / 2.0 * grid_laplacian((3, 4)).toarray()) @ T.ravel()
+    assert np.allclose(heat_grid_solution(0.7, T, 2.0, 0.5).ravel(), expected_values, rtol=1e-14)
     system, dt = lt.models.heat_grid((3, 4), 2.0, 0.5), 1e-5
     rates = np.asarray(system.vector_field(2.0 * np.log(T).ravel())).reshape(3, 4) * T / 2.0
     difference = heat_grid_solution(dt, T, 2.0, 0.5) - heat_grid_solution(-dt, T, 2.0, 0.5)
@@ -383,8 +383,8 @@ def test_a_csv_file(tmp_path):
     assert len(ordered) == 3
     system = lt.models.thermo_particles(np.ones(3), ordered.matrix)
     T = np.exp([0.1, 0.5, -0.3])
-    expected = ordered.matrix @ T - ordered.matrix.sum(axis=1) * T  # T S'
-    assert np.allclose(system.vector_field(np.log(T)) * T, expected, rtol=0, atol=1e-14)
+    expected_values = ordered.matrix @ T - ordered.matrix.sum(axis=1) * T  # T S'
+    assert np.allclose(system.vector_field(np.log(T)) * T, expected_values, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize(

@@ -101,13 +101,13 @@ def evaluate_functions(system, x, d, compensation, k):
 @pytest.mark.sampled(3)
 def test_functions_are_the_same(name):
     system = SYSTEMS[name]
-    found, x = reorder_spins(system), state(system)
+    found_values, x = reorder_spins(system), state(system)
     d, compensation, k = (scale * jnp.asarray(RANDOM.standard_normal(shape)) for scale, shape in shapes(x.size))
     one = evaluate_functions(system, x, d, compensation, k)
-    other = evaluate_functions(found.system, *map(found.reorder_state, (x, d, compensation, k)))
-    assert found.system.energy.is_quadratic == system.energy.is_quadratic
+    other = evaluate_functions(found_values.system, *map(found_values.reorder_state, (x, d, compensation, k)))
+    assert found_values.system.energy.is_quadratic == system.energy.is_quadratic
     np.testing.assert_allclose(other[0], one[0], rtol=1e-13, atol=1e-13)
-    np.testing.assert_allclose(found.restore_state(other[2]), one[2], rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(found_values.restore_state(other[2]), one[2], rtol=1e-12, atol=1e-13)
     assert 0.3 < float(other[1] / one[1]) < 3.0  # the size of a rounding, which sums have in another order
 
 
@@ -121,17 +121,22 @@ def shapes(n):
 def test_steps_are_the_same(name, method):
     system, h = SYSTEMS[name], jnp.asarray(0.02)
     method = method.on(system)
-    found = reorder_spins(system)
+    found_values = reorder_spins(system)
     one = initial_run_state_program(system, method, state(system))
-    other = initial_run_state_program(found.system, pullback_method(method, found), found.reorder_state(state(system)))
+    other = initial_run_state_program(
+        found_values.system, pullback_method(method, found_values), found_values.reorder_state(state(system))
+    )
     step = jax.jit(take_step)
     for _ in range(3):
-        one, other = step(system, method, one, h), step(found.system, pullback_method(method, found), other, h)
+        one, other = (
+            step(system, method, one, h),
+            step(found_values.system, pullback_method(method, found_values), other, h),
+        )
     assert int(one.status) == int(other.status) == 0
     for name in ("x", "energy", "entropy", "largest_energy_increment", "energy_sensitivity"):
         ours = getattr(other, name)
         np.testing.assert_allclose(
-            found.restore_state(ours) if name == "x" else ours, getattr(one, name), rtol=1e-11, atol=1e-13
+            found_values.restore_state(ours) if name == "x" else ours, getattr(one, name), rtol=1e-11, atol=1e-13
         )
 
 
@@ -149,12 +154,12 @@ def test_a_run_of_a_large_system_is_in_that_order_and_no_user_sees_it(method, mo
     x0 = system.state(unit(N_LARGE))
     assert x0.size > DEFAULT_OPTIONS.rms_norm_dim
     run = (system, x0, (0.0, 0.2), 0.05, method)
-    found = lt.integrate(*run)
-    assert found.audit().passed
-    np.testing.assert_allclose(np.linalg.norm(system.spins(found.x), axis=-1), 1.0, atol=1e-14)
+    found_values = lt.integrate(*run)
+    assert found_values.audit().passed
+    np.testing.assert_allclose(np.linalg.norm(system.spins(found_values.x), axis=-1), 1.0, atol=1e-14)
     monkeypatch.setattr("liethermo.engines.step.reorder_spins", lambda system: None)
     jax.clear_caches()
-    np.testing.assert_allclose(found.x, lt.integrate(*run).x, rtol=1e-11, atol=1e-13)
+    np.testing.assert_allclose(found_values.x, lt.integrate(*run).x, rtol=1e-11, atol=1e-13)
     jax.clear_caches()
 
 
@@ -175,10 +180,10 @@ def test_adaptive_steps_are_the_same(monkeypatch):
         system = ring()
         return lt.integrate(system, system.state(unit(N_LARGE)), (0.0, 0.2), lt.Adaptive(1e-6), METHODS[-1]).x[-1]
 
-    found = path()
+    found_values = path()
     monkeypatch.setattr("liethermo.engines.step.reorder_spins", lambda system: None)
     jax.clear_caches()
-    np.testing.assert_allclose(found, path(), rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(found_values, path(), rtol=1e-10, atol=1e-12)
     jax.clear_caches()
 
 
@@ -189,10 +194,10 @@ def test_noise_is_that_of_sites_whatever_the_order(monkeypatch):
         noise = lt.Fluctuations(1e-3, seed=1)
         return lt.integrate(system, system.state(unit(N_LARGE)), (0.0, 0.2), 0.05, noise=noise).x[-1]
 
-    found = path()
+    found_values = path()
     monkeypatch.setattr("liethermo.engines.step.reorder_spins", lambda system: None)
     jax.clear_caches()
-    np.testing.assert_allclose(found, path(), rtol=1e-11, atol=1e-13)
+    np.testing.assert_allclose(found_values, path(), rtol=1e-11, atol=1e-13)
     jax.clear_caches()
 
 
@@ -214,9 +219,9 @@ def test_derivatives_go_through():
     def end(x):
         return lt.flow(system, x, (0.0, 0.1), 0.05, method)
 
-    found = jax.jvp(end, (x0,), (v,))[1]
+    found_values = jax.jvp(end, (x0,), (v,))[1]
     h = 1e-5
-    np.testing.assert_allclose(found, (end(x0 + h * v) - end(x0 - h * v)) / (2 * h), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(found_values, (end(x0 + h * v) - end(x0 - h * v)) / (2 * h), rtol=1e-5, atol=1e-6)
 
 
 def test_what_has_no_other_order():
@@ -250,9 +255,9 @@ def test_the_two_orders():
 def test_control_a_wrong_order_is_seen():
     """Steps from a state in the other order, taken for one that is not."""
     system = ring()
-    found = reorder_spins(system)
+    found_values = reorder_spins(system)
     first = initial_run_state_program(system, lt.MetriplecticMidpoint(), jnp.asarray(system.state(unit(N_LARGE))))
     right = array_engine.advance(system, lt.MetriplecticMidpoint(), first, *map(jnp.asarray, (0.05, 1, 1)), 1)[0]
-    wrong = first._replace(x=found.reorder_state(first.x))
+    wrong = first._replace(x=found_values.reorder_state(first.x))
     other = array_engine.advance(system, lt.MetriplecticMidpoint(), wrong, *map(jnp.asarray, (0.05, 1, 1)), 1)[0]
-    assert np.abs(right.x - found.restore_state(other.x)).max() > 1e-3
+    assert np.abs(right.x - found_values.restore_state(other.x)).max() > 1e-3

@@ -204,8 +204,8 @@ def test_orders_against_scipy(method, kind, exact):
     system, errors = rubbing(from_all_sides, warm=False, reconstruction=kind), []
     for n in STEPS[method.order]:
         run = lt.integrate(system, START, (0.4, 2.4), 2.0 / n, method, save_every=n, engine="compiled")
-        found = [*run.x[-1], *run.attitude[-1].ravel(), *(run.casimirs[f"impulse {i}"][-1] for i in (1, 2, 3))]
-        errors.append([np.abs(found - exact[:-1]).max(), abs(run.casimirs["work"][-1] - exact[-1])])
+        found_values = [*run.x[-1], *run.attitude[-1].ravel(), *(run.casimirs[f"impulse {i}"][-1] for i in (1, 2, 3))]
+        errors.append([np.abs(found_values - exact[:-1]).max(), abs(run.casimirs["work"][-1] - exact[-1])])
         assert run.audit().passed, run.audit()
         if kind == "cayley":
             assert row(run, "drift of momentum in space less the impulse").value <= LAW
@@ -231,10 +231,10 @@ def test_a_body_is_spun_up_from_rest(name):
     torque, axis = 0.3, 2
     system = rubbing(lt.torques.ConstantInBody(torque * np.eye(3)[axis]))
     run = lt.integrate(system, np.zeros(3), (0.0, 10.0), 0.1, METHODS[name], engine="compiled")
-    expected = torque * run.t
-    assert np.abs(run.x[:, axis] - expected).max() < 1e-14
-    assert np.abs(run.casimirs["work"] - expected**2 / (2 * INERTIA[axis])).max() < 1e-14
-    assert np.abs(run.casimirs["impulse 3"] - expected).max() < 1e-14
+    expected_values = torque * run.t
+    assert np.abs(run.x[:, axis] - expected_values).max() < 1e-14
+    assert np.abs(run.casimirs["work"] - expected_values**2 / (2 * INERTIA[axis])).max() < 1e-14
+    assert np.abs(run.casimirs["impulse 3"] - expected_values).max() < 1e-14
     assert run.audit().passed
 
 
@@ -457,8 +457,8 @@ def test_files_provenance_and_dense_output(tmp_path):
 def test_what_the_user_asks_of_a_system():
     system, attitude = rubbing(TORQUES["space"], warm=False), np.asarray(SO3.exp(np.array([0.4, -0.2, 0.7])))
     here = system.at_time(0.5, attitude)
-    expected = np.asarray(system.drop_torque().vector_field(START)) + attitude.T @ [0.1, 0.2, -0.1]
-    assert np.allclose(here.vector_field(START), expected, rtol=1e-14)
+    expected_values = np.asarray(system.drop_torque().vector_field(START)) + attitude.T @ [0.1, 0.2, -0.1]
+    assert np.allclose(here.vector_field(START), expected_values, rtol=1e-14)
     timed = rubbing(lambda t, mu: t * mu, warm=False)
     assert np.allclose(timed.vector_field(START, 2.0), timed.drop_torque().vector_field(START) + 2.0 * START)
     assert system.check().passed
