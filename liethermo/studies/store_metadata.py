@@ -93,7 +93,7 @@ class ZarrArray:
         if not (is_valid_shape and len(shape) == len(chunks) == len(dims) and math.prod(chunks) <= MAX_CHUNK_VALUES):
             raise ValueError(f"the array {name!r} has shape {shape} in chunks {chunks}")
         if not isinstance(attributes, dict) or array.metadata() != metadata:  # other readers use its codecs
-            raise ValueError(f"the array {name!r} is none that a study writes")
+            raise ValueError(f"a study writes no array {name!r}")
         return array
 
     @property
@@ -221,7 +221,7 @@ def parse_group_metadata(root: Path, group_metadata: dict[str, Any]) -> tuple[di
         if not is_valid_name(name):
             raise ValueError(f"nothing in it can be called {name!r:.120}")
     if shared_names := {*measures} & {*axes, *columns}:
-        raise ValueError(f"{shared_names.pop()!r} is a measure and an axis")
+        raise ValueError(f"{shared_names.pop()!r} names a measure and an axis; rename one of them")
     if math.prod(status.shape) > MAX_POINTS or math.prod(status.chunk_grid) > MAX_CHUNKS:
         raise ValueError(f"no study has points in shape {status.shape} and chunks {status.chunks}")
     array_attributes = {name: array.attributes for name, array in arrays.items()}

@@ -137,7 +137,7 @@ class Study:
         self._measures, until = parse_measures_and_event(measure, until)
         axis_names = {*self._axes.names, *self._axes.parameter_names}
         if shared_names := axis_names & {*self._measures}:
-            raise InputError(f"{shared_names.pop()!r} is a measure and an axis")
+            raise InputError(f"{shared_names.pop()!r} names a measure and an axis; rename one of them")
         check_noise(noise)
         method = checked_method(method, noise)
         check_choice("engine", engine, ("auto", "array", "compiled"))

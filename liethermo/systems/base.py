@@ -90,7 +90,7 @@ class System(SystemInterface):
         Without ``check_poisson`` an expensive check is skipped, because Pi is a Poisson tensor by construction.
         """
         if not isinstance(baths, HeatBaths | None):
-            raise InputError(f"baths are lt.HeatBaths(...), not {type(baths).__name__}")
+            raise InputError(f"baths must be lt.HeatBaths(...), not {type(baths).__name__}")
         self.dim, self.space = dim, space
         self.poisson = trace_callables(poisson, lambda poisson, x: poisson.sharp(x, x), (dim,))
         self.energy = checked_energy(

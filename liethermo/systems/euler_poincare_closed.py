@@ -82,7 +82,9 @@ class EulerPoincareClosedSystem(LedgerSystem):
         heat_power=None,
     ):
         if not isinstance(algebra, mf.LieAlgebra):
-            raise InputError(f"the algebra is a manifolds.LieAlgebra, such as mf.so(3), not {type(algebra).__name__}")
+            raise InputError(
+                f"the algebra must be a manifolds.LieAlgebra, such as mf.so(3), not {type(algebra).__name__}"
+            )
         n = algebra.dim
         checked_energy(make_energy(lambda x: lagrangian(x[:n], x[n]), "the Lagrangian"), n + 1, "the Lagrangian")
         lagrangian = trace_callables(lagrangian, lambda lagrangian, *a: lagrangian(*a), (n,), ())

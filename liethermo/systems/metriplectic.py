@@ -85,7 +85,7 @@ class MetriplecticSystem(System):
             space = mf.GroupSpace(space) if isinstance(space, mf.MatrixGroup) else space
             if not isinstance(space, mf.Space):
                 raise InputError(
-                    f"the space is a manifolds.Space such as manifolds.Sphere(2), not {type(space).__name__}; "
+                    f"the space must be a manifolds.Space, such as manifolds.Sphere(2), not {type(space).__name__}; "
                     "for a manifold of geomstats give manifolds.from_geomstats(...)"
                 )
             dim = space.size if dim is None else dim

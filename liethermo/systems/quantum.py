@@ -129,14 +129,16 @@ class QuantumSystem(System):
         times=None,
     ):
         if not isinstance(baths, HeatBaths | None):
-            raise InputError(f"baths are lt.HeatBaths(...), not {type(baths).__name__}")
+            raise InputError(f"baths must be lt.HeatBaths(...), not {type(baths).__name__}")
         self.time = None
         size, energy = hamiltonian_energy(hamiltonian, times)
         self.structure = structure = mf.DensityMatrices(size)
         self.parts, self.names = checked_parts(parts, names, size)
         entropy = VonNeumann() if entropy is None else entropy
         if not isinstance(entropy, VonNeumann):
-            raise InputError(f"the entropy of a density matrix is lt.VonNeumann(...), not {type(entropy).__name__}")
+            raise InputError(
+                f"the entropy of a density matrix must be lt.VonNeumann(...), not {type(entropy).__name__}"
+            )
         self.floor = entropy.floor
         total = sum_dissipations(dissipation)
         if total is None or all(isinstance(term, LindbladJumps) for term in total.terms):

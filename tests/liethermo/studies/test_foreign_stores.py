@@ -104,7 +104,7 @@ def test_a_measure_cannot_have_the_name_of_a_place(store, name):
     initial_files = {path for path in store.parent.parent.rglob("*") if store not in path.parents}
     messages = collect_errors(change_metadata(store, rename_measure(name)))
     assert len(messages) == 5
-    assert all("nothing in it can be called" in text or "is a measure and an axis" in text for text in messages)
+    assert all("nothing in it can be called" in text or "names a measure and an axis" in text for text in messages)
     assert {path for path in store.parent.parent.rglob("*") if store not in path.parents} == initial_files
     with pytest.raises(lt.InputError):
         lt.Study(

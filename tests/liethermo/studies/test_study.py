@@ -292,7 +292,7 @@ def test_a_study_that_cannot_run_is_refused_before_anything_is_written(changes, 
     [
         ({"measure": {}}, "measure must be a dict"),
         ({"measure": {"m": "median"}}, "the measure 'm' must be lt.Relaxed"),
-        ({"measure": {"rate": "final"}}, "'rate' is a measure and an axis"),
+        ({"measure": {"rate": "final"}}, "'rate' names a measure and an axis"),
         ({"measure": {"m": lt.At([1.0, 9.0])}}, "got 1 to 9"),
         ({"measure": {"a": lt.Relaxed(1e-3), "b": lt.Relaxed(1e-4)}}, "is to end it too"),
         ({"chunk": 0}, "chunk must be a positive integer"),

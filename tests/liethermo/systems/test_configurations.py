@@ -395,7 +395,7 @@ def test_units():
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: lt.EvolutionSystem(jnp.sum, space="S2"), r"space is a manifolds.Space.*not str"),
+        (lambda: lt.EvolutionSystem(jnp.sum, space="S2"), r"space must be a manifolds.Space.*not str"),
         (lambda: lt.EvolutionSystem(jnp.sum, 5, space=mf.Sphere(2)), r"on S\^2 a state.*has 7 components, not 5"),
         (lambda: lt.EvolutionSystem(jnp.sum), r"2n \+ 1 for n degrees of freedom, 3 at least, not None"),
         (lambda: lt.EvolutionSystem(jnp.sum, space=mf.SpecialUnitary(2)), r"SU\(2\) is complex"),
