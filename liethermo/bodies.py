@@ -23,6 +23,7 @@ from .results.orientation import (
     precession,
     quaternions,
     rotation,
+    rotor_rates,
     spin,
 )
 from .systems.rotations import AttitudeWarning, attitude
@@ -51,6 +52,7 @@ __all__ = [
     "rate_of",
     "read_csv",
     "rotation",
+    "rotor_rates",
     "spin",
     "write_csv",
 ]

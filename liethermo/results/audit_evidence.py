@@ -143,7 +143,7 @@ def largest_drifts(runs: Iterable[Mapping[str, InvariantDrift]]) -> dict[str, In
     return largest
 
 
-VELOCITY_AXES = {"angular_velocity": "axis", "joint_rates": "joint_coordinate"}
+VELOCITY_AXES = {"angular_velocity": "axis", "rotor_rates": "rotor", "joint_rates": "joint_coordinate"}
 """Velocities that belong to the states of a result, by name, and the name of their last axis in datasets."""
 
 
@@ -186,7 +186,7 @@ class AuditableResult(SaveableResult):
         return Evidence() if self.evidence_source is None else self.evidence_source()
 
     def velocities(self) -> dict[str, np.ndarray]:
-        """Return the velocities that belong to the states, by name: of a rigid body, and of joints."""
+        """Return the velocities that belong to the states, by name: of a rigid body, its rotors, and of joints."""
         return {name: source() for name, source in self.velocity_sources.items()}
 
     def __getstate__(self) -> dict[str, Any]:  # a pickled copy has the evidence itself, not the function

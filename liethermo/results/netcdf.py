@@ -64,6 +64,7 @@ LONG_NAMES = {
     "precession": "angle by which that axis has turned about the angular momentum in space",
     "spin": "angle by which the body has turned about that axis",
     "angular_velocity": "angular velocity of the body, in body axes",
+    "rotor_rates": "rates of the rotors relative to the body",
     "joint_rates": "rates of the joint coordinates, in the order of the state",
     "invariant_name": "names of the recorded functions",
     "invariant": "Casimirs, momentum maps, preserved functions and what comes from outside",
@@ -83,7 +84,7 @@ DEFAULT_UNITS = {"quaternion": "1", "nutation": "rad", "precession": "rad", "spi
 
 def unit_of_variable(name: str, units: Mapping[str, str]) -> str | None:
     """Return the unit of a variable for the units that a user gives; None if it is unknown."""
-    if name == "angular_velocity" and "time" in units:
+    if name in ("angular_velocity", "rotor_rates") and "time" in units:
         return units.get(name, f"rad/{units['time']}")
     return units.get(name, DEFAULT_UNITS.get(name))
 

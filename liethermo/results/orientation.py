@@ -142,14 +142,52 @@ def angular_velocity(
     """
     if frame not in ("body", "space"):
         raise InputError(f"frame must be 'body' or 'space', got {frame!r}")
-    if solution.x is None:
-        raise InputError('no states were kept: run the ensemble with outputs="final" or "trajectory"')
-    if "angular_velocity" not in solution.velocity_sources:
-        raise InputError("the result has no angular velocity: its system contains no rigid body on so(3) or se(3)")
-    omega = solution.velocity_sources["angular_velocity"]()
+    absence = "no angular velocity: its system contains no rigid body on so(3) or se(3)"
+    omega = _velocities_of(solution, "angular_velocity", absence)
     if frame == "space":
         omega = np.einsum("...ij,...j->...i", _attitudes(solution), omega)
     return np.rad2deg(omega) if degrees else omega
+
+
+def rotor_rates(solution: AuditableResult, degrees: bool = False) -> np.ndarray:
+    """Return the rates at which wheels and other rotors turn relative to the body that carries them.
+
+    Parameters
+    ----------
+    solution : Solution, or Ensemble
+        A result of a body with rotors, such as :func:`liethermo.models.reaction_wheels`. A state with given rates is
+        ``system.state(angular_velocity=..., rotor_rates=...)``.
+    degrees : bool
+        If true, the unit is degrees / time instead of rad / time.
+
+    Returns
+    -------
+    ndarray, shape (times, rotors); in an ensemble trajectories are first
+
+    Raises
+    ------
+    InputError
+        If the system has no rotors, or no states were kept.
+
+    Examples
+    --------
+    >>> body = lt.models.reaction_wheels(friction=0.01)
+    >>> x0 = body.state(angular_velocity=(0, 0, 0.1), rotor_rates=(20.0, 0.0, 5.0))
+    >>> run = lt.integrate(body, x0, (0.0, 1.0), 0.5)
+    >>> lt.bodies.rotor_rates(run)[0].round(12).tolist()
+    [20.0, 0.0, 5.0]
+    """
+    rates = _velocities_of(solution, "rotor_rates", "no rotor rates: its system is not a rigid body with rotors")
+    return np.rad2deg(rates) if degrees else rates
+
+
+def _velocities_of(solution: AuditableResult, name: str, absence: str) -> np.ndarray:
+    """Return the velocities of a name at the states of a result; raise InputError, with ``absence``, without any."""
+    if solution.x is None:
+        raise InputError('no states were kept: run the ensemble with outputs="final" or "trajectory"')
+    if name not in solution.velocity_sources:
+        raise InputError(f"the result has {absence}")
+    return solution.velocity_sources[name]()
 
 
 def joint_rates(solution: AuditableResult) -> dict[str, np.ndarray]:
@@ -188,11 +226,7 @@ def joint_rates(solution: AuditableResult) -> dict[str, np.ndarray]:
     >>> lt.bodies.joint_rates(solution)["wheel"].round(12).tolist()
     [0.2, 0.2, 0.2]
     """
-    if solution.x is None:
-        raise InputError('no states were kept: run the ensemble with outputs="final" or "trajectory"')
-    if "joint_rates" not in solution.velocity_sources:
-        raise InputError("the result has no joint rates: its system is not a tree of jointed bodies")
-    rates = solution.velocity_sources["joint_rates"]()
+    rates = _velocities_of(solution, "joint_rates", "no joint rates: its system is not a tree of jointed bodies")
     first = min(start for start, _ in solution.provenance["joints"].values())
     return solution.split_by_joint(rates, first)
 

@@ -23,6 +23,7 @@ from ..tracing.traced import trace_callables
 from .body_states import checked_velocity, is_given_by_velocity
 from .euler_poincare import require_regular
 from .ledger import LedgerSystem
+from .lie_poisson import is_body_algebra
 from .torque import begins_with_rotations
 
 
@@ -153,7 +154,10 @@ class EulerPoincareClosedSystem(LedgerSystem):
 
     @property
     def velocity_functions(self):
-        return {"angular_velocity": lambda x: x[:3]} if begins_with_rotations(self.algebra) else {}
+        if not begins_with_rotations(self.algebra):
+            return {}
+        functions, n = {"angular_velocity": lambda x: x[:3]}, self.algebra.dim
+        return functions | ({"rotor_rates": lambda x: x[3:n]} if is_body_algebra(self.algebra) and n > 3 else {})
 
     def temperature_at(self, y) -> jax.Array:
         return -jax.grad(self.lagrangian, argnums=1)(y[:-1], y[-1])

@@ -102,8 +102,8 @@ class SystemInterface(Geometry):
     def velocity_functions(self) -> dict[str, Callable]:
         """Functions of a state, shape (n,), to velocities that a solution shows, shape (k,), by name.
 
-        They are ``angular_velocity`` of a rigid body, in body axes, and ``joint_rates`` in the order of
-        :attr:`joint_ranges`.
+        They are ``angular_velocity`` of a rigid body, in body axes, ``rotor_rates`` of its rotors relative to it, and
+        ``joint_rates`` in the order of :attr:`joint_ranges`.
         """
         return {}
 

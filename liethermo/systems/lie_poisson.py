@@ -154,7 +154,7 @@ class LiePoissonSystem(TorqueSystem):
 
     @property
     def inertia(self) -> np.ndarray | None:
-        if not _is_body_algebra(self.algebra) or is_traced(self.energy) or self.energy.depends_on_time:
+        if not is_body_algebra(self.algebra) or is_traced(self.energy) or self.energy.depends_on_time:
             return None
         energy = self.drop_baths().energy
         return _inertia_tensor(energy, self.algebra.dim) if energy.is_quadratic else None
@@ -163,7 +163,11 @@ class LiePoissonSystem(TorqueSystem):
     def velocity_functions(self):
         if not begins_with_rotations(self.algebra):
             return {}
-        return {"angular_velocity": lambda x: self.energy.gradient(x)[:3]}
+        functions = {"angular_velocity": lambda x: self.energy.gradient(x)[:3]}
+        n = self.algebra.dim
+        if n > 3 and is_body_algebra(self.algebra):
+            functions["rotor_rates"] = lambda x: self.energy.gradient(x)[3:n]
+        return functions
 
     def state(
         self, x=None, batch: bool = False, *, angular_velocity=None, rotor_rates=None, temperature=None, t=None
@@ -339,7 +343,7 @@ def _gradient_and_hessian(energy: Energy, x) -> tuple[jax.Array, jax.Array]:
 
 
 @functools.lru_cache(maxsize=64)
-def _is_body_algebra(algebra: mf.LieAlgebra) -> bool:
+def is_body_algebra(algebra: mf.LieAlgebra) -> bool:
     """Return whether the algebra is so(3), or its direct sum with an abelian algebra of internal parts."""
     return algebra.dim >= 3 and _extends_algebra(mf.so(3), algebra)
 

@@ -170,6 +170,11 @@ def test_a_state_has_the_angular_velocity_and_temperature_it_was_given(name):
         assert np.allclose(system.temperatures(x0), 1.7)
     solution = lt.integrate(system, x0, (0.0, 0.5), 0.1)
     assert np.allclose(lt.bodies.angular_velocity(solution)[0], omega, atol=1e-15)
+    if n_rotors:
+        assert np.allclose(lt.bodies.rotor_rates(solution)[0], rates["rotor_rates"], atol=1e-14)
+    else:
+        with pytest.raises(lt.InputError, match="no rotor rates"):
+            lt.bodies.rotor_rates(solution)
     both = system.state(angular_velocity=np.stack([omega, 2 * omega]), batch=True, **rates, **heat)
     assert np.allclose(both[0], x0)
 
@@ -231,3 +236,20 @@ def test_ensembles_and_files_have_angular_velocities(tmp_path):
         lt.bodies.angular_velocity(lt.ensemble(MODELS["rigid body"](), [1.0, 0, 0], (0.0, 1.0), 0.1, outputs="summary"))
     with pytest.raises(lt.InputError, match="no rigid body"):
         lt.bodies.angular_velocity(lt.integrate(lt.models.damped_oscillator(), [1.0, 0.0, 0.0], (0.0, 0.1), 0.1))
+
+
+def test_rotor_rates_of_a_driven_body_and_of_an_ensemble(tmp_path):
+    """A motor of torque u turns a free wheel by ``p' = u``, with ``p = J (a . Omega + w)``."""
+    J, u = 0.1, 0.02
+    body = lt.models.reaction_wheels((3.0, 2.0, 1.5), [[0, 0, 1.0]], J, torque=lt.torques.Motor([u]), attitude=False)
+    x0 = body.state(angular_velocity=(0.1, 0.0, 0.2), rotor_rates=[4.0])
+    solution = lt.integrate(body, x0, (0.0, 2.0), 0.1)
+    spin = lt.bodies.angular_velocity(solution)[:, 2]
+    rates = 4.0 + u * solution.t / J - (spin - spin[0])
+    assert np.allclose(lt.bodies.rotor_rates(solution)[:, 0], rates, atol=1e-12)
+    assert np.allclose(lt.bodies.rotor_rates(solution, degrees=True)[:, 0], np.degrees(rates), atol=1e-10)
+    loaded = lt.load(solution.save(tmp_path / "run.nc", units={"time": "s"}))
+    assert np.array_equal(lt.bodies.rotor_rates(loaded), lt.bodies.rotor_rates(solution))
+    assert solution.to_xarray(units={"time": "s"})["rotor_rates"].attrs["units"] == "rad/s"
+    many = lt.ensemble(body, np.stack([x0, x0]), (0.0, 2.0), 0.1)
+    assert np.allclose(lt.bodies.rotor_rates(many)[:, 0], rates[-1], atol=1e-12)
