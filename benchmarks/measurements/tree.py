@@ -14,18 +14,36 @@ from ..report import Report, Table, build_available
 
 N_HINGES = 9
 """Number of hinges; their axes are x, y and z in turn."""
-BASE_INERTIA, LINK_INERTIA = (2.0, 1.5, 1.0), (0.05, 0.06, 0.07)
-"""Principal moments of the base, of mass 5 kg, and of each link, of mass 1 kg (kg m^2)."""
-LINK_CENTRE, HINGE_PLACE = (0.2, 0.05, 0.0), (0.4, 0.0, 0.1)
-"""Centre of mass of a link from its hinge, and place of a hinge in the body before it (m)."""
+
+BASE_INERTIA = (2.0, 1.5, 1.0)
+"""Principal moments of the base, of mass 5 kg (kg m^2)."""
+
+LINK_INERTIA = (0.05, 0.06, 0.07)
+"""Principal moments of each link, of mass 1 kg (kg m^2)."""
+
+LINK_CENTRE = (0.2, 0.05, 0.0)
+"""Centre of mass of a link from its hinge (m)."""
+
+HINGE_PLACE = (0.4, 0.0, 0.1)
+"""Place of a hinge in the body before it (m)."""
+
 STIFFNESS = 0.5
 """Stiffness of each hinge (N m / rad)."""
+
 ANGULAR_VELOCITY = (0.3, 0.1, 0.8)
 """Initial angular velocity of the base in its axes (rad / s)."""
+
 INITIAL_ANGLES = 0.1 * np.arange(N_HINGES)
 """Initial angles of the hinges (rad); their rates are zero."""
-COLUMNS = {"Solver": "text", "Step / s": "number", "Seconds / step": "seconds", "Energy": "error", "Size": "error",
-           "Vector in space": "error"}  # fmt: skip
+
+COLUMNS = {
+    "Solver": "text",
+    "Step / s": "number",
+    "Seconds / step": "seconds",
+    "Energy": "error",
+    "Size": "error",
+    "Vector in space": "error",
+}
 """Columns of the table: the changes of the energy, the size and the vector of the angular momentum are relative."""
 
 
