@@ -45,6 +45,7 @@ CLASS_MEMBERS.update(
         "LieVariational": "attitudes",
         # Results
         "Solution": "audit energy_balance save to_xarray from_file",
+        "AuditableResult": "joints velocities",
         "Ensemble": "ok audit save to_xarray from_file event_time message member_solution member_status member_stats",
         "Fluctuations": "of check increments",
     }.items()

@@ -1,10 +1,13 @@
 """The members of classes that users call: what ``help()`` and the reference show.
 
-A class shows the members that :data:`CLASS_MEMBERS` names for it and for its base classes. One that has no entry, and
-no base class with one, shows every public member.
+A class shows the members that :data:`CLASS_MEMBERS` names for it and for its base classes. A class that has no entry,
+and no base class with one, shows every public member. An enumeration shows its members.
 """
 
 from __future__ import annotations
+
+from abc import ABCMeta
+from enum import EnumType
 
 CLASS_MEMBERS: dict[str, tuple[str, ...]] = {
     name: tuple(members.split())
@@ -60,8 +63,31 @@ def listed_names(cls: type) -> list[str]:
             names |= dict.fromkeys(CLASS_MEMBERS[base.__qualname__])
         elif package not in (*LIBRARY_PACKAGES, "equinox", "builtins", "collections"):
             names |= dict.fromkeys(name for name in vars(base) if not name.startswith("_"))
-    return sorted(name for name in names if hasattr(cls, name)) if has_entry else list(type.__dir__(cls))
+    if not has_entry:
+        return sorted(name for name in type.__dir__(cls) if not name.startswith("_"))
+    return sorted(name for name in names if hasattr(cls, name))
 
 
 LIBRARY_PACKAGES = {"manifolds"}
 """Packages whose classes show the members that :data:`CLASS_MEMBERS` names."""
+
+
+class ListedType(type):
+    """Type of classes of which ``dir``, and so ``help``, lists the members that users call.
+
+    The ``dir`` of an instance is complete.
+    """
+
+    def __dir__(cls) -> list[str]:
+        return listed_names(cls)
+
+
+class ListedABCMeta(ListedType, ABCMeta):
+    """Type of abstract base classes whose ``dir`` lists the members that users call."""
+
+
+class ListedEnumType(EnumType):
+    """Type of enumerations whose ``dir`` lists their members, without the methods of str or int."""
+
+    def __dir__(cls) -> list[str]:
+        return list(cls.__members__)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import equinox as eqx
 import jax
 
-from ._class_members import listed_names
+from ._class_members import ListedType
 
 Copied = TypeVar("Copied", bound=eqx.Module)
 
@@ -18,14 +18,8 @@ if TYPE_CHECKING:
     from equinox._module._module import _ModuleMeta as ListedModuleType
 else:
 
-    class ListedModuleType(type(eqx.Module)):
-        """Type of the classes of pytrees: ``dir`` of a class, and so ``help``, lists the members that users call.
-
-        What an instance has is listed in full.
-        """
-
-        def __dir__(cls) -> list[str]:
-            return listed_names(cls)
+    class ListedModuleType(ListedType, type(eqx.Module)):
+        """Type of the classes of pytrees, whose ``dir`` lists the members that users call."""
 
 
 class Module(eqx.Module, metaclass=ListedModuleType):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import textwrap
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
 from html import escape
+
+from ._class_members import ListedABCMeta
 
 VERDICT_TEXTS = {True: "ok", False: "FAILS", None: "-"}
 """Text of each verdict; None means that the value has no limit."""
@@ -23,7 +25,7 @@ class TableRow:
     note: str = ""
 
 
-class Tabular(ABC):
+class Tabular(metaclass=ListedABCMeta):
     """Base class of objects that print as a table of text, and show as an HTML table in a notebook."""
 
     @abstractmethod

@@ -15,6 +15,7 @@ from jinja2.sandbox import SandboxedEnvironment
 
 import liethermo
 import manifolds
+from manifolds._class_members import ListedEnumType, ListedType
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 sys.path.insert(0, str(DOCS))
@@ -141,6 +142,8 @@ HELP_LINES = {
     liethermo.Quadratic: 60,
     liethermo.KillingDissipation: 60,
     liethermo.DoubleBracket: 60,
+    liethermo.Solution: 140,
+    liethermo.Ensemble: 180,
 }
 """Classes that users meet first, and the largest number of lines of their help: 580 of the first with internals.
 
@@ -155,6 +158,33 @@ def test_help_lists_what_users_call(owner):
     assert set(dir(owner)) - values == set(api_members.shown_members(owner))
     for name in dir(owner):
         assert f" {name}" in text
+
+
+INTERNAL_NAME = re.compile(r"^ \|  _\w+", re.MULTILINE)
+"""Name of an internal member in the text of ``help()``, such as ``__eq__`` or ``__dataclass_fields__``."""
+
+MAX_LINES_WITH_INTERNALS = 100
+"""Lines of the help of a class that lists its internals: about two screens."""
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_help_lists_no_internals(name):
+    """Only named tuples and exceptions, whose type Python fixes, and small classes list their internals."""
+    owner = CLASSES[name]
+    text = pydoc.render_doc(owner, renderer=pydoc.plaintext)
+    if isinstance(owner, ListedType | ListedEnumType):
+        assert INTERNAL_NAME.findall(text) == []
+    else:
+        assert issubclass(owner, tuple | Exception) or text.count("\n") <= MAX_LINES_WITH_INTERNALS
+
+
+def test_help_of_an_enumeration_lists_its_members():
+    stabilities = dir(liethermo.Stability)
+    assert set(stabilities) == set(liethermo.Stability.__members__)
+    text = pydoc.render_doc(liethermo.Stability, renderer=pydoc.plaintext)
+    assert text.count("\n") <= 40
+    assert all(f" {stability}" in text for stability in stabilities)
+    assert "capitalize" in dir(str(liethermo.Stability.STABLE))
 
 
 def test_help_of_an_instance_is_complete():

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from manifolds._class_members import ListedABCMeta
+
 from ..errors import FileError, InputError
 from ..units import TIME, parse_unit, split_label
 
@@ -35,7 +37,7 @@ class Trajectory(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Records(Sequence[Trajectory]):
+class Records(Sequence[Trajectory], metaclass=ListedABCMeta):
     """Trajectories from a table, with the names of its columns; :func:`read_data` returns them.
 
     A fit takes the columns by the names in the result of ``observe``, or all of them in order.

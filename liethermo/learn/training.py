@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 
+from manifolds._class_members import ListedType
+
 from .. import disk
 from ..errors import FileError, InputError
 from ..runs.progress import Progress
@@ -79,7 +81,7 @@ class ConfidenceInterval(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Training:
+class Training(metaclass=ListedType):
     """The record of a fit.
 
     Attributes

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from manifolds._arrays import is_traced
+from manifolds._class_members import ListedType
 
 from ..errors import FunctionError, InputError
 from ..functions.checks import traced_function_and_shape
@@ -47,7 +48,7 @@ class _Body(NamedTuple):
     joint: Joint | None
 
 
-class Tree:
+class Tree(metaclass=ListedType):
     """A tree of rigid bodies that are joined by hinges, sliders and universal joints, free in space or on the ground.
 
     The axes of all bodies are parallel to those of the base if all joint coordinates are zero, and the origin of a body

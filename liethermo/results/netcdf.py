@@ -8,7 +8,7 @@ import io
 import json
 import os
 import sys
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from manifolds._class_members import ListedABCMeta
 from manifolds.errors import warn
 
 from .. import disk
@@ -124,7 +125,7 @@ def build_dataset(
     return dataset.assign_attrs(sha256=checksum(content, attributes))
 
 
-class SaveableResult(ABC):
+class SaveableResult(metaclass=ListedABCMeta):
     """A result that can be saved to a file, which :func:`liethermo.load` reads."""
 
     @abstractmethod

@@ -11,6 +11,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._class_members import ListedType
+
 from ..dissipation.geometry import divergence_terms_of_fields
 from ..dissipation.noise import factor_residuals
 from ..errors import InputError
@@ -29,7 +31,7 @@ exceeds it; clipping changes the variance by 1e-8."""
 
 
 @dataclass(frozen=True)
-class Fluctuations:
+class Fluctuations(metaclass=ListedType):
     """Thermal noise that matches the dissipation: ``dx = (Pi dH + K dS + k div K) dt + sqrt(2 k) B dW`` with ``B B^T =
     K``.
 

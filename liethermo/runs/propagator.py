@@ -10,6 +10,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from manifolds._class_members import ListedType
 from manifolds._precision import with_library_settings
 
 from ..engines.select_engine import ENGINES
@@ -55,7 +56,7 @@ MAX_CACHED_SCHEDULE_STEPS = 10_000
 _schedules: LRUCache[StepSchedule] = LRUCache(MAX_CACHED_SCHEDULES)
 
 
-class Propagator:
+class Propagator(metaclass=ListedType):
     """A system, a method and a step, prepared once: for optimisers, samplers and control loops.
 
     ``p(x0, t_span)`` returns what :func:`integrate` returns. ``p.final(x0, t_span)`` returns the last state alone,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from manifolds._class_members import ListedType
 from manifolds._precision import with_library_settings
 from manifolds.errors import warn
 
@@ -56,7 +57,7 @@ WARN_UNVECTORISED_POINTS = 1_000
 """Number of points above which the user is warned that each system is built separately."""
 
 
-class Study:
+class Study(metaclass=ListedType):
     """Runs over grids and samples of parameters, in chunks whose results are kept.
 
     A point that cannot run, that fails or that breaks a law has its own status and message, and the others go on. The

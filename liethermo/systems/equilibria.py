@@ -9,6 +9,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from manifolds._class_members import ListedABCMeta
 from manifolds._precision import with_library_settings
 
 from ..errors import ConvergenceError, InputError
@@ -99,7 +100,7 @@ class Equilibrium:
 
 
 @dataclass(frozen=True, eq=False)
-class Equilibria(Sequence):
+class Equilibria(Sequence, metaclass=ListedABCMeta):
     """A list of equilibria, sorted by stability and then by energy, as :func:`equilibria` returns it.
 
     Attributes

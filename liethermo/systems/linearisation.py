@@ -13,6 +13,7 @@ import numpy as np
 import scipy
 
 from manifolds._arrays import is_traced
+from manifolds._class_members import ListedEnumType
 from manifolds._precision import with_library_settings
 
 from ..errors import InputError
@@ -44,7 +45,7 @@ UNKNOWN_CASIMIRS = "Casimirs without a formula"
 """Name of the level sets of Casimirs that are not known as functions; their tangent space is the range of Pi."""
 
 
-class Stability(enum.StrEnum):
+class Stability(enum.StrEnum, metaclass=ListedEnumType):
     """Stability of an equilibrium on its leaf."""
 
     ASYMPTOTIC = "asymptotically stable"

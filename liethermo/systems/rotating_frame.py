@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._class_members import ListedType
 from manifolds._pytree_module import Module
 from manifolds.matrices.linear import adjoint
 
@@ -22,7 +23,7 @@ from ..functions.energy import Energy
 from .hamiltonian import hamiltonian_energy
 
 
-class RotatingFrame:
+class RotatingFrame(metaclass=ListedType):
     """A frame that turns by ``exp(-i G t)``: its density matrices are ``exp(i G t) rho exp(-i G t)`` (hbar = 1).
 
     There the Hamiltonian is ``exp(i G t) H(t) exp(-i G t) - G``. It is constant for a drive that turns with G. A linear

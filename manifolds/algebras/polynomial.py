@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._arrays import real_components
+from .._class_members import ListedType
 from .._names import checked_names, component_names
 from ..errors import ComponentError, ShapeError
 
@@ -22,7 +23,7 @@ Coefficient = Fraction | float
 
 @jax.tree_util.register_static
 @dataclass(frozen=True, init=False, repr=False)
-class Polynomial:
+class Polynomial(metaclass=ListedType):
     """Polynomial in the components ``mu1, mu2, …`` of ``mu``.
 
     Polynomials are immutable and hashable, hence static leaves of a pytree. Sums, differences and products with

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._class_members import ListedType
 from ..errors import LieAlgebraError, ShapeError
 from . import substructure
 from ._null_space import numerical_rank, row_echelon
@@ -18,7 +19,7 @@ from ._subspaces import fraction_rows, is_exact
 from .structure import AlgebraStructure
 
 
-class StructureMethods:
+class StructureMethods(metaclass=ListedType):
     """Subspaces of an algebra as arrays whose rows span them, in the basis of the algebra.
 
     Where the structure constants are rational the rows are coprime integers, and exact. Otherwise they are orthonormal,

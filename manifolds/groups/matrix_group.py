@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._arrays import first_true_index, format_index, is_traced, real_components, square_matrices
+from .._class_members import ListedType
 from ..algebras.lie_algebra import LieAlgebra
 from ..errors import ComponentError, DomainError, LieAlgebraError
 from ..matrices.exponential import CAYLEY_CONDITION_LIMIT, cayley_of
@@ -70,7 +71,7 @@ def registered_groups() -> Iterator[MatrixGroup]:
 
 @jax.tree_util.register_static
 @dataclass(frozen=True, repr=False)
-class MatrixGroup:
+class MatrixGroup(metaclass=ListedType):
     """Group of matrices: its algebra, a measure of distance from it, and maps with special formulas.
 
     Build one with its name (``manifolds.SO(3)``). A new group needs its algebra, with matrices, and ``defect``; the

@@ -11,13 +11,14 @@ are not available, check that :meth:`Retraction.reach` is below 1.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .._arrays import first_true_index, format_index, is_traced
+from .._class_members import ListedABCMeta
 from .._pytree_module import forward_to
 from ..errors import DomainError, SpaceError
 from ..spaces.base import Space
@@ -30,7 +31,7 @@ Each iteration multiplies the distance from the middle by the squared distance o
 """
 
 
-class Retraction(ABC):
+class Retraction(metaclass=ListedABCMeta):
     r"""Map ``R_h(z, v) -> (x, y)`` on a state space, with its inverse.
 
     Attributes

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from functools import partial
 from typing import Any, ClassVar
 
@@ -12,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._arrays import is_traced
+from .._class_members import ListedABCMeta
 from ..errors import SpaceError
 from ..matrices.linear import solve_near_identity
 
 
-class SpaceMaps(ABC):
+class SpaceMaps(metaclass=ListedABCMeta):
     """Maps of a state space as its author writes them: plain JAX functions of checked arrays.
 
     Leading axes are batches. ``name``, ``dim``, ``shape`` and ``_project`` are required; the other maps have defaults

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from manifolds._class_members import ListedType
+
 from ...errors import InputError
 
 SHELL_TOLERANCE = 1e-6
@@ -160,7 +162,7 @@ def _axis_values(value, axes: int, what: str) -> tuple:
 
 
 @dataclass(frozen=True, eq=False)
-class Lattice:
+class Lattice(metaclass=ListedType):
     """A piece of a crystal: cells along one, two or three vectors, each with the atoms of a basis.
 
     :func:`lattice` builds one. Every term of ``lt.magnetism``, and ``lt.SpinSystem``, accepts it in place of ``sites``.
