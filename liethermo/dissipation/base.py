@@ -190,8 +190,8 @@ class Dissipation(Module):
     def added_momentum(self, dH, bracket_dH_dS) -> jax.Array | None:
         """Return the covector F, shape (n,), if the force is ``ad*_dH F`` (forced Euler-Poincaré); otherwise None.
 
-        ``bracket_dH_dS`` is ``[dH, dS]``. F is added to the momentum of the motion, ``x' = ad*_dH (x + F)``: one
-        coadjoint action instead of two.
+        ``bracket_dH_dS`` is the Lie bracket ``[dH, dS]``, shape (n,). F is added to the momentum of the motion,
+        ``x' = ad*_dH (x + F)``, so a step takes one coadjoint action instead of two.
         """
         return None
 

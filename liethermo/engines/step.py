@@ -296,8 +296,9 @@ def can_correct_energy_drift(system: System, method: OneStepMethod) -> bool:
 
 
 def energy_drift_multiplier(system: System, x, compensation, energy, first_energy) -> jax.Array:
-    """Return the multiple of the energy gradient that is subtracted from a state, by ``eps |x| / 4`` at most.
+    """Return the multiple of ∇H to subtract from x to correct the drift of the energy.
 
+    The shift is at most ``eps |x| / 4``.
     Each step is exact up to a few roundings, whose sum is a random walk: 1e-13 in 1e6 steps for a general energy. A sum
     above a few roundings of H itself is corrected, far below the rounding of the state. If H contains a large constant,
     discrete gradients leave out defects below the rounding of that constant: then up to one such rounding is corrected.
@@ -313,7 +314,7 @@ would move the body by any amount."""
 
 
 def drift_correction_multiplier(system: System, function: Energy, x, compensation, value, level) -> jax.Array:
-    """Return the multiple of the gradient of a function that shifts x so that its value comes nearer to ``level``.
+    """Return the multiple of ∇F to subtract from x to bring the function F back towards its value ``level``.
 
     The shift is about ``eps |x| / 4`` at most, and zero unless value and level differ by more than a few roundings.
     """

@@ -252,7 +252,7 @@ def _quantum_body(system: System) -> QuantumSystem:
 
 
 def _clock_and_work(system: DrivenSystem, x, h, middle, end) -> jax.Array:
-    """Return the displacements of clock and work over a step, by Simpson's rule for the power."""
+    """Return the increments of the clock and of the work in a step, shape (2,); Simpson's rule integrates the power."""
     states = jnp.stack([x[:-2], middle, end])
     times = x[-2] + jnp.array([0.0, 0.5, 1.0]) * h * system.unit
     points = jnp.concatenate([states, times[:, None], jnp.zeros((3, 1))], axis=1)

@@ -95,7 +95,7 @@ def _lagrange_values(stages: int, theta) -> np.ndarray:
 
 
 def _legendre_values(stages: int, x) -> np.ndarray:
-    """Return ``P_0 … P_s`` at x, along a new last axis."""
+    """Return the Legendre polynomials ``P_0 … P_s`` at x, shape (..., s + 1), where s is ``stages``."""
     values = [np.ones_like(x), x]
     for m in range(1, stages):
         values.append(((2 * m + 1) * x * values[m] - m * values[m - 1]) / (m + 1))

@@ -282,7 +282,7 @@ class NoiseLevels(NamedTuple):
 
 
 def noise_levels(data: list[Trajectory], scale: np.ndarray) -> NoiseLevels:
-    """Return the standard deviations of the errors of each component, or upper bounds of them."""
+    """Estimate the standard deviation of the noise of each component, or an upper bound if no noise is visible."""
     levels = np.array([_divided_difference_stds([_column_values(tr, k) for tr in data]) for k in range(len(scale))])
     is_noise = (levels[:, -1] > NOISE_PLATEAU_RATIO * levels[:, -3]) & (levels[:, -1] > MIN_RELATIVE_NOISE * scale)
     std = np.where(is_noise, levels[:, -3:].mean(axis=1), levels.min(axis=1))

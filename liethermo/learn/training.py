@@ -228,7 +228,7 @@ class Training(metaclass=ListedType):
         )
 
     def estimate(self, quantity: Callable[[jax.Array], Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Return a quantity that depends on the parameters, and its standard error by linear propagation.
+        """Return a function of the fitted parameters, and its standard error by linear propagation of errors.
 
         Parameters
         ----------

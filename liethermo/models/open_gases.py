@@ -142,7 +142,7 @@ def porous_piston_state(
     """
     defaults = {name: parameter.default for name, parameter in inspect.signature(porous_piston).parameters.items()}
     if unknown := [name for name in parameters if name not in defaults]:
-        raise InputError(f"porous_piston has no parameter {unknown[0]!r}: it has {', '.join(defaults)}")
+        raise InputError(f"porous_piston has no parameter {unknown[0]!r}. Its parameters are {', '.join(defaults)}")
     area, length, capacity = (
         checked_positive((defaults | parameters)[name], name) for name in ("area", "length", "capacity")
     )

@@ -245,7 +245,7 @@ class _MjcfReader:
                 raise InputError(f"angle of the compiler must be degree or radian, got {angle!r}")
             self.angle_unit = 1.0 if angle == "radian" else np.pi / 180.0
             if compiler.get("inertiafromgeom", "auto") == "true":
-                raise InputError("inertiafromgeom='true' is not covered: give each body an inertial element")
+                raise InputError("inertiafromgeom='true' is not covered. Give each body an inertial element")
         for default in root.findall("default"):
             _refuse_children(default, "default", {"joint"}, MJCF_SHAPES | {"mesh", "material", "pair"})
             for joint in default.findall("joint"):
@@ -267,7 +267,7 @@ class _MjcfReader:
             )  # fmt: skip
         inertial = body.find("inertial")
         if inertial is None:
-            raise InputError(f"the body {name!r} needs an inertial element: inertias of shapes are not covered")
+            raise InputError(f"the body {name!r} needs an inertial element, since inertias of shapes are not computed")
         R, centre = self._frame(inertial)
         inertia = R @ _mjcf_inertia(inertial, name) @ R.T
         rotation, origin = self._frame(body)
@@ -282,7 +282,7 @@ class _MjcfReader:
         joint = Element("joint", attributes)
         what, kind = f"the joint {attributes.get('name', 'of ' + body)!r}", attributes.get("type", "hinge")
         if kind not in ("hinge", "slide"):
-            raise InputError(f"{what} is of type {kind!r}, which is not covered. The types that are: hinge, slide")
+            raise InputError(f"{what} is of type {kind!r}, which is not covered. Supported types are hinge and slide")
         for attribute in ("armature", "frictionloss", "springdamper", "ref"):
             _refuse_nonzero(joint, attribute, what)
         ignored = MJCF_JOINT_ATTRIBUTES | {"armature", "frictionloss", "springdamper", "ref"}
@@ -303,7 +303,7 @@ class _MjcfReader:
         position = _numbers(element, "pos", 3, np.zeros(3))
         kinds = [kind for kind in MJCF_ORIENTATIONS if kind in element.attrib]
         if len(kinds) > 1:
-            raise InputError(f"{element.tag} has two orientations, {' and '.join(kinds)}: give one")
+            raise InputError(f"{element.tag} must have one orientation, got {' and '.join(kinds)}")
         if not kinds:
             return np.eye(3), position
         if kinds[0] == "quat":
@@ -315,7 +315,7 @@ class _MjcfReader:
         if kinds[0] == "euler":
             angles = self.angle_unit * _numbers(element, "euler", 3)
             return Rotation.from_euler("XYZ", angles).as_matrix(), position  # eulerseq="xyz" means rotating axes
-        raise InputError(f"the orientation {kinds[0]!r} of {element.tag} is not covered: give quat")
+        raise InputError(f"the orientation of {element.tag} must be quat, axisangle or euler, got {kinds[0]}")
 
 
 def _mjcf_inertia(inertial: Element, name: str) -> np.ndarray:
@@ -364,7 +364,7 @@ def _assemble(links: list[LinkRecord], has_ground: bool) -> list[BodyRecord]:
     frames: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}  # group, rotation and origin in it, of each link
     for link in links:
         if link.name in frames:
-            raise InputError(f"there are two bodies of the name {link.name!r}")
+            raise InputError(f"two bodies have the name {link.name!r}")
         if link.parent is None:
             group_name, R, origin = link.name, np.eye(3), np.zeros(3)
             groups[link.name] = _Group(link.name, None, np.zeros(3), ())
@@ -385,7 +385,7 @@ def _assemble(links: list[LinkRecord], has_ground: bool) -> list[BodyRecord]:
             group.centres.append(origin + R @ link.centre)
             group.inertias.append(R @ link.inertia @ R.T)
         elif np.any(link.inertia):
-            raise InputError(f"{link.name!r} has an inertia and no mass")
+            raise InputError(f"{link.name!r} has an inertia but no mass")
     return _records(groups, has_ground)
 
 
@@ -493,7 +493,7 @@ def _refuse_children(element: Element, what: str, covered: set[str], ignored: se
 def _refuse_nonzero(element: Element, name: str, what: str) -> None:
     """Raise InputError if an attribute has a value that is not zero."""
     if name in element.attrib and _numbers(element, name, len(element.attrib[name].split())).any():
-        raise InputError(f"{name}={element.attrib[name]!r} of {what} is not covered: it must be zero")
+        raise InputError(f"{name} of {what} must be zero, got {element.attrib[name]!r}")
 
 
 def _child(element: Element, tag: str) -> Element:

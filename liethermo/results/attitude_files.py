@@ -168,5 +168,5 @@ def _factor_to_si(path: Path, quantity: str, name: str, si_unit: str) -> float:
     except InputError as error:
         raise FileError(f"{path} has {quantity} in {name!r}: {error}") from None
     if unit.dimension != parse_unit(si_unit).dimension:
-        raise FileError(f"{path} has {quantity} in {name!r}. Convert them to {si_unit}")
+        raise FileError(f"{path} has {quantity} in {name!r}, a unit of another kind. Convert the column to {si_unit}")
     return unit.factor

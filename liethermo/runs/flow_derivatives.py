@@ -207,7 +207,11 @@ def state_derivatives(
 def _lower_order_rows(
     derivatives: Sequence[np.ndarray], direction_sets: Sequence[tuple[int, ...]], chunk: slice
 ) -> np.ndarray:
-    """Return derivatives along all proper subsets of each direction set: shape (steps, sets, 2**rank, n + q + m)."""
+    """Return the derivatives along each proper subset of each direction set, shape (steps, sets, 2**rank, n + q + m).
+
+    The rank is the number of directions in a set. The bits of an index of the third axis select the subset; its last
+    entry, for the whole set, is zero.
+    """
     chunk_derivatives, rank = [a[chunk] for a in derivatives], len(direction_sets[0])
     rows = np.zeros((len(chunk_derivatives[0]), len(direction_sets), 2**rank, chunk_derivatives[0].shape[1]))
     for i, directions in enumerate(direction_sets):

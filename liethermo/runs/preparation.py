@@ -99,7 +99,7 @@ def checked_method(method, noise: Fluctuations | None = None, *, runs_alone: boo
 
 
 def check_steps(method, step, noise: Fluctuations | None, until=None, dense: bool = False, save_at=None) -> None:
-    """Raise InputError if the method or the noise of a run does not go with its step, or with its other options."""
+    """Raise InputError if the method or the noise of a run cannot be combined with its step or its other options."""
     is_examined = isinstance(step, Adaptive) or until is not None or dense
     if isinstance(method, Reference) and (is_examined or save_at is not None):
         raise InputError(REFERENCE_STEPS)

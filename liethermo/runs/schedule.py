@@ -316,12 +316,14 @@ def _save_times(save_at, start: float, end: float, breaks: tuple[float, ...]) ->
 
 
 def clip_times_to_span(times: np.ndarray, start: float, end: float, name: str) -> np.ndarray:
-    """Return times clipped to a span, if they lie outside of it by rounding alone: 0.1 + 0.1 + 0.1 > 0.3.
+    """Return times, of which those outside the span by a rounding error are moved to its ends.
+
+    Such an error arises if a user adds times: ``0.1 + 0.1 + 0.1 > 0.3``.
 
     Raises
     ------
     InputError
-        If a time lies outside of the span.
+        If a time is outside the span by more than rounding.
     """
     rounding = TIME_TOLERANCE_ULPS * EPS * max(abs(start), abs(end) if math.isfinite(end) else 0.0)
     invalid_times = times[~((times >= start - rounding) & (times <= end + rounding))]

@@ -28,9 +28,9 @@ def checked_density_matrices(rho: np.ndarray, size: int, mixed: float) -> np.nda
         If an array has another shape, or is not Hermitian, positive and of trace one.
     """
     if rho.dtype.kind not in "fiuc":
-        raise InputError(f"a density matrix is an array of numbers, not of {rho.dtype}")
+        raise InputError(f"a density matrix must be an array of numbers, got {rho.dtype}")
     if not np.isfinite(rho).all():
-        raise InputError("the density matrix is not finite")
+        raise InputError("the density matrix must be finite")
     if size > 1 and rho.shape == (1, size):  # a bra
         rho = adjoint(rho)
     if size > 1 and rho.shape == (size**2, 1):  # an operator as QuTiP stacks it, by columns
@@ -39,21 +39,21 @@ def checked_density_matrices(rho: np.ndarray, size: int, mixed: float) -> np.nda
         rho = _density_of_kets(rho[:, None] if rho.ndim == 1 else rho)
     if rho.shape[-2:] != (size, size):
         raise InputError(
-            f"a density matrix of this system has shape ({size}, {size}), not {rho.shape}; a ket has the shape "
+            f"a density matrix of this system must have shape ({size}, {size}), got {rho.shape}; a ket has the shape "
             f"({size},) or ({size}, 1)"
         )
     asymmetry = float(np.abs(rho - adjoint(rho)).max())
     if asymmetry > DENSITY_MATRIX_TOLERANCE:
-        raise InputError(f"the density matrix is not Hermitian: it differs from its adjoint by {asymmetry:.3g}")
+        raise InputError(f"the density matrix must be Hermitian, but it differs from its adjoint by {asymmetry:.3g}")
     trace = np.trace(rho, axis1=-2, axis2=-1).real
     wrong_trace = float(trace.ravel()[np.argmax(np.abs(trace - 1.0))])
     if abs(wrong_trace - 1.0) > DENSITY_MATRIX_TOLERANCE:
-        raise InputError(f"the density matrix has the trace {wrong_trace:.15g}, not 1: divide it by that")
+        raise InputError(f"the density matrix must have trace 1, got {wrong_trace:.15g}. Divide it by its trace")
     min_eigenvalue = float(np.linalg.eigvalsh(rho)[..., 0].min())
     if min_eigenvalue < -NEGATIVE_EIGENVALUE_LIMIT:
-        raise InputError(f"the density matrix is not positive: its least eigenvalue is {min_eigenvalue:.3g}")
+        raise InputError(f"the density matrix must be positive, but its least eigenvalue is {min_eigenvalue:.3g}")
     if not isinstance(mixed, int | float | np.number) or not 0.0 <= mixed <= 1.0:
-        raise InputError(f"mixed is a share of the identity, from 0 to 1, not {mixed!r}")
+        raise InputError(f"mixed, the weight of the maximally mixed state, must be a number from 0 to 1, got {mixed!r}")
     return (1.0 - mixed) * rho + mixed * np.eye(size) / size
 
 
@@ -62,7 +62,7 @@ def _density_of_kets(ket: np.ndarray) -> np.ndarray:
     norms = np.linalg.norm(ket, axis=-2)
     wrong_norm = float(norms.ravel()[np.argmax(np.abs(norms - 1.0))])
     if abs(wrong_norm - 1.0) > DENSITY_MATRIX_TOLERANCE:
-        raise InputError(f"the ket has the norm {wrong_norm:.15g}, not 1: divide it by that")
+        raise InputError(f"the ket must have norm 1, got {wrong_norm:.15g}. Divide the ket by its norm")
     ket = ket / norms[..., None]
     return ket @ adjoint(ket)
 
@@ -71,10 +71,10 @@ def checked_parts(parts, names, size: int) -> tuple[tuple[int, ...], tuple[str, 
     """Return the dimensions of the factors of a product, and their names."""
     parts = (size,) if parts is None else tuple(int(n) for n in parts)
     if math.prod(parts) != size or min(parts) < 1:
-        raise InputError(f"the parts have the sizes {parts}, whose product is not {size}")
+        raise InputError(f"the product of the sizes of the parts must be {size}, got the sizes {parts}")
     names = tuple(names)
     if names and (len(names) != len(parts) or len(set(names)) != len(names)):
-        raise InputError(f"there are {len(parts)} parts, each with a name of its own, not {names!r}")
+        raise InputError(f"names must be {len(parts)} different names, one for each part, got {names!r}")
     return parts, names
 
 

@@ -334,9 +334,9 @@ class SystemInterface(Geometry):
         return EngineHints(can_unroll=is_smooth and not is_complex, is_smooth=is_smooth)
 
     def sparsity_pattern(self) -> scipy.sparse.csr_array | None:
-        """Return the sparsity pattern of the Jacobian of the field, shape (n, n), discrete gradients included.
+        """Return the sparsity pattern of the Jacobian of the field, shape (n, n); None if it is not known.
 
-        None if it is not known. Large systems with a pattern are solved by sparse Newton iteration.
+        It holds for discrete gradients too. Large systems with a pattern are solved by sparse Newton iteration.
         """
         return None
 

@@ -28,7 +28,7 @@ SEARCH_SEEDS = (0, 1, 2, 3)
 
 
 def retract(system: System, x, v) -> jax.Array:
-    """Return the state that a displacement v, shape (n,), leads to, moved onto the state space."""
+    """Return ``x + v``, shape (n,), projected onto the state space."""
     if system.space is None:
         return x + v
     return system.space.to_vector(system.space._project(system.points(x + v)))

@@ -133,7 +133,7 @@ class LiePoissonSystem(TorqueSystem):
         torque=None,
     ):
         if not isinstance(algebra, mf.LieAlgebra):
-            raise InputError(f"the algebra must be a manifolds.LieAlgebra, not {type(algebra).__name__}")
+            raise InputError(f"the algebra must be a manifolds.LieAlgebra, got {type(algebra).__name__}")
         self.algebra = algebra
         self.group, self.reconstruction = group, _resolve_reconstruction(algebra, group, reconstruction)
         self._set_torque(torque)
@@ -205,7 +205,7 @@ class LiePoissonSystem(TorqueSystem):
         if not is_given_by_velocity(self, x, angular_velocity, "momentum", **details):
             return super().state(x, batch)
         if temperature is not None and self.baths is None:
-            raise InputError("temperature= is for a system with baths: give it baths=lt.HeatBaths(...)")
+            raise InputError("temperature= needs a system with baths. Build the system with baths=lt.HeatBaths(...)")
         velocity = checked_velocity(angular_velocity, rotor_rates, self.algebra.dim, batch)
         momentum = self.momentum_of_velocity(velocity, t)
         if temperature is not None:
@@ -221,7 +221,7 @@ class LiePoissonSystem(TorqueSystem):
         energy = self.drop_baths().energy
         if energy.depends_on_time:
             if t is None:
-                raise InputError("the energy depends on time: give the time t= of the state")
+                raise InputError("the energy depends on time, so the state needs its time t=")
             energy = energy.at_time(t)
         return momentum_of_velocity(energy, jnp.asarray(xi))
 
@@ -289,10 +289,10 @@ def _resolve_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str |
     """Return the checked name of a reconstruction, by default the best one for the group; None without a group."""
     if group is None:
         if reconstruction is not None:
-            raise InputError("a reconstruction needs a group to live in: give group=..., such as manifolds.SO(3)")
+            raise InputError("reconstruction= needs group=, for example manifolds.SO(3)")
         return None
     if not isinstance(group, mf.MatrixGroup):
-        raise InputError(f"the group must be a manifolds.MatrixGroup such as SO(3), not {type(group).__name__}")
+        raise InputError(f"the group must be a manifolds.MatrixGroup such as SO(3), got {type(group).__name__}")
     if not _extends_algebra(group.algebra, algebra):
         raise InputError(f"{group.name} is not a group of {algebra.name}: the structure constants differ")
     if reconstruction is None:

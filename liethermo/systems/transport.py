@@ -35,7 +35,7 @@ def has_generator(system: SystemInterface) -> bool:
 
 
 def generator_field(system: SystemInterface, x) -> jax.Array:
-    """Return the vector field at x, shape (n,), in the form that does not contain the entropy."""
+    """Return the vector field at x, shape (n,), by the generator of the dissipation, without the entropy."""
     assert system.dissipation is not None
     dH = system.energy.gradient(x)
     return system.poisson.sharp(x, dH) + system.dissipation.generator_field(system, x, dH)

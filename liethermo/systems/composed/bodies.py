@@ -52,7 +52,7 @@ class Subsystem(Module):
         elif isinstance(species, bool) or not isinstance(species, int) or species < 0 or dim != 1 + species:
             raise InputError(
                 f"{name or 'a subsystem'} holds {species!r} kinds of particles, so its state is (S, N) of dim 1 + "
-                f"species, not {dim!r}; a wall that moves is a body of its own"
+                f"species, got dim {dim!r}. Make a wall that moves a body of its own"
             )
         self.dim, self.name = dim, name
         energy = Quadratic(jnp.zeros(dim)) if energy is None else make_energy(energy, "the energy of a subsystem")
@@ -106,7 +106,7 @@ class Copies(Module):
 
     def __init__(self, count: int, energy, dim: int, parameters=(), friction=None, name: str | None = None):
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            raise InputError(f"count is the number of bodies, an integer >= 1, not {count!r}")
+            raise InputError(f"count, the number of bodies, must be an integer >= 1, got {count!r}")
         _check_dim(dim)
         self.count, self.dim, self.name = count, dim, name
         self.energy = Quadratic(jnp.zeros(dim)) if energy is None else energy
@@ -147,15 +147,15 @@ def name_subsystems(subsystems) -> tuple[tuple[str, ...], tuple[Subsystem | Copi
         )
     for name, body in zip(names, bodies, strict=True):
         if not isinstance(body, Subsystem | Copies):
-            raise InputError(f"{name} must be an lt.Subsystem or lt.Copies, not {type(body).__name__}")
+            raise InputError(f"{name} must be an lt.Subsystem or lt.Copies, got {type(body).__name__}")
     if not bodies:
-        raise InputError("a composed system has at least one subsystem")
+        raise InputError("a composed system must have at least one subsystem")
     return names, bodies
 
 
 def _check_dim(dim) -> None:
     if isinstance(dim, bool) or not isinstance(dim, int) or dim < 1 or dim % 2 == 0:
-        raise InputError(f"dim counts the components of a state (q, p, S): 2n + 1, and 1 for S alone, not {dim!r}")
+        raise InputError(f"dim, the size of a state (q, p, S), must be 2n + 1, or 1 for S alone, got {dim!r}")
 
 
 def _check_friction(friction, dim: int, name: str):
@@ -166,7 +166,7 @@ def _check_friction(friction, dim: int, name: str):
         raise InputError(f"{name} has no momenta, so it cannot have friction")
     if isinstance(friction, str):
         if friction != "contact":
-            raise InputError(f"friction of {name} is a coefficient or 'contact', not {friction!r}")
+            raise InputError(f"friction of {name} must be a coefficient or 'contact', got {friction!r}")
         return friction
     if callable(friction):
         shapes, at = ((), (n,), (n, n)), f"a state of shape ({dim},)"
@@ -184,13 +184,12 @@ def _check_copies_friction(friction, count: int, dim: int, name: str):
     n, R = dim // 2, checked_numbers(friction, f"friction of {name}")
     if n == 0 or R.shape not in ((), (n,), (count, n)):
         raise InputError(
-            f"friction of {name}, {count} with {n} momenta each, has shape (), ({n},) or ({count}, {n}), not {R.shape}"
+            f"friction of {name}, {count} with {n} momenta each, must have shape (), ({n},) or ({count}, {n}), "
+            f"got {R.shape}"
         )
     return _require_nonnegative(jnp.broadcast_to(R, (count, n)), name)
 
 
 def _require_nonnegative(R: jax.Array, name: str) -> jax.Array:
-    require_condition(
-        R.min(), lambda r: r >= 0.0, f"friction of {name} must be >= 0, not {{value:g}}: it would cool the body"
-    )
+    require_condition(R.min(), lambda r: r >= 0.0, f"friction of {name} must be >= 0, got {{value:g}}")
     return R

@@ -49,18 +49,18 @@ class Membrane(Module):
         self.permeability = _check_coefficient(permeability, "the permeability of a membrane")
         pair = (species, species) if isinstance(species, int) else species
         if not (isinstance(pair, tuple) and len(pair) == 2 and all(type(kind) is int for kind in pair)):
-            raise InputError(f"the species of a membrane are a whole number, or a pair of them, not {species!r}")
+            raise InputError(f"the species of a membrane must be an integer or a pair of integers, got {species!r}")
         self.species = pair
         self.carries = checked_numbers(carries, "the entropy that a particle carries", ())
         require_condition(
-            self.carries, lambda s: abs(s) < np.inf, "the entropy that a particle carries is finite, not {value}"
+            self.carries, lambda s: abs(s) < np.inf, "the entropy that a particle carries must be finite, got {value}"
         )
 
     def process(self, names: Sequence[str], structure: mf.ExtendedPhaseSpace) -> Process:
         """Return the process of the membrane between bodies of the given names, in states of a structure."""
         a, b = (_body_index(body, names) for body in (self.first, self.second))
         if a == b:
-            raise InputError(f"a membrane joins two bodies, not {names[a]} with itself")
+            raise InputError(f"a membrane must join two bodies, got {names[a]} twice")
         stoichiometry, sides = np.zeros(len(structure.particle_indices.N)), np.zeros((2, len(names)))
         for body, kind, sign in ((a, self.species[0], 1.0), (b, self.species[1], -1.0)):
             stoichiometry[_particle_index(body, kind, names, structure.particle_indices)] = sign
@@ -93,7 +93,7 @@ class Reaction(Module):
         self.body, self.rate = body, _check_coefficient(rate, "the rate of a reaction")
         numbers = checked_numbers(stoichiometry, "the stoichiometry of a reaction")
         if numbers.ndim != 1 or not (np.isfinite(numbers).all() and np.any(numbers)):
-            raise InputError(f"the stoichiometry of a reaction is a row of finite numbers, not {numbers.tolist()}")
+            raise InputError(f"the stoichiometry of a reaction must be a row of finite numbers, got {numbers.tolist()}")
         self.stoichiometry = tuple(numbers.tolist())
 
     def process(self, names: Sequence[str], structure: mf.ExtendedPhaseSpace) -> Process:
@@ -103,7 +103,8 @@ class Reaction(Module):
         indices = np.flatnonzero(matter.owner == body)
         if len(indices) != len(self.stoichiometry):
             raise InputError(
-                f"a reaction in {names[body]} has {len(indices)} stoichiometric numbers, not {len(self.stoichiometry)}"
+                f"a reaction in {names[body]} must have {len(indices)} stoichiometric numbers, "
+                f"got {len(self.stoichiometry)}"
             )
         stoichiometry, heat_shares = np.zeros(len(matter.N)), np.zeros(len(names))
         stoichiometry[indices], heat_shares[body] = self.stoichiometry, 1.0
@@ -116,7 +117,7 @@ def _check_coefficient(coefficient, what: str) -> jax.Array | Callable:
     if callable(coefficient):
         return coefficient
     value = checked_numbers(coefficient, what, ())
-    require_condition(value, lambda L: (L >= 0.0) & (np.inf > L), what + " must be >= 0 and finite, not {value}")
+    require_condition(value, lambda L: (L >= 0.0) & (np.inf > L), what + " must be >= 0 and finite, got {value}")
     return value
 
 
@@ -130,15 +131,15 @@ def _check_state_function(coefficient, dim: int, what: str) -> jax.Array | Calla
 def _body_index(body, names: Sequence[str]) -> int:
     if isinstance(body, str) and body in names:
         if list(names).count(body) > 1:
-            raise InputError(f"{body!r} is the name of several bodies: give the number of the one that is meant")
+            raise InputError(f"{body!r} is the name of several bodies. Give the number of a body instead")
         return list(names).index(body)
     if isinstance(body, int) and not isinstance(body, bool) and 0 <= body < len(names):
         return body
-    raise InputError(f"there is no body {body!r}: the bodies are {', '.join(names)}, counted from 0")
+    raise InputError(f"there is no body {body!r}. The bodies are {', '.join(names)}, counted from 0")
 
 
 def _particle_index(body: int, kind: int, names: Sequence[str], matter: ParticleIndices) -> int:
     indices = np.flatnonzero(matter.owner == body)
     if not 0 <= kind < len(indices):
-        raise InputError(f"{names[body]} has {len(indices)} kinds of particles, so no number {kind}")
+        raise InputError(f"{names[body]} has {len(indices)} kinds of particles, counted from 0, got the kind {kind}")
     return int(indices[kind])

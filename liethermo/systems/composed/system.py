@@ -110,7 +110,7 @@ class ComposedSystem(System):
         reactions: Sequence[Reaction] = (),
     ):
         if conduction not in ("discrete", "midpoint"):
-            raise InputError(f"conduction is 'discrete' or 'midpoint', not {conduction!r}")
+            raise InputError(f"conduction must be 'discrete' or 'midpoint', got {conduction!r}")
         self.labels, self.subsystems = name_subsystems(subsystems)
         dofs, kinds = (
             tuple(n for body in self.subsystems for n in (getattr(body, name),) * body.count)
@@ -124,7 +124,9 @@ class ComposedSystem(System):
         exchanges += [*(reactions if isinstance(reactions, list | tuple) else [reactions])]
         for item in exchanges:
             if not isinstance(item, Membrane | Reaction):
-                raise InputError(f"membranes and reactions are lt.Membrane and lt.Reaction, not {type(item).__name__}")
+                raise InputError(
+                    f"membranes and reactions must be lt.Membrane and lt.Reaction, got {type(item).__name__}"
+                )
         processes = [item.process(self.names, structure) for item in exchanges]
         if processes:
             matter = MatterExchange(processes)
@@ -322,7 +324,7 @@ def _coupling_energy(V, structure: mf.ExtendedPhaseSpace) -> Energy:
     if isinstance(V, Energy):
         return V
     if not callable(V):
-        raise InputError(f"a coupling is a function of q, or of (q, S), or an Energy, not {type(V).__name__}")
+        raise InputError(f"a coupling must be a function of q, or of (q, S), or an Energy, got {type(V).__name__}")
     q, _, S, _ = structure.state_indices
     n_arguments, N = required_argument_count(V), structure.particle_indices.N
     if n_arguments == 1:
@@ -360,7 +362,7 @@ def _split_conductances(conductance, bodies: int) -> tuple[Any, list[tuple[int, 
         conductance = [(0, 1, conductance)]
         if bodies != 2:
             raise InputError(
-                f"the conductance as one function is meant for two bodies, not {bodies}: give edges (i, j, function)"
+                f"a conductance given as one function needs two bodies, got {bodies}. Give edges (i, j, function)"
             )
     is_edge_list = isinstance(conductance, list | tuple) and all(isinstance(edge, tuple) for edge in conductance)
     functions = [edge for edge in conductance if any(map(callable, edge))] if is_edge_list else []

@@ -282,11 +282,11 @@ def test_unusable_couplings(arguments, words):
 
 
 test_unusable_subsystems = refusal_test(
-    (lambda: lt.Subsystem(lambda x: x[0], 2), "2n \\+ 1, and 1 for S alone"),
+    (lambda: lt.Subsystem(lambda x: x[0], 2), "2n \\+ 1, or 1 for S alone"),
     (lambda: lt.Subsystem(Warm(jnp.asarray(1.0)), 1, friction=1.0), "no momenta"),
-    (lambda: lt.Subsystem(CART.energy, 3, friction=-1.0), ">= 0, not -1"),
+    (lambda: lt.Subsystem(CART.energy, 3, friction=-1.0), ">= 0, got -1"),
     (lambda: lt.Subsystem(CART.energy, 3, friction=[1.0, 2.0]), "shape"),
-    (lambda: lt.Subsystem(CART.energy, 3, friction="dry"), "'contact', not 'dry'"),
+    (lambda: lt.Subsystem(CART.energy, 3, friction="dry"), "'contact', got 'dry'"),
     (
         lambda: lt.Subsystem(CART.energy, 3, friction=lambda x: x),
         r"must have shape \(\) or \(1,\) or \(1, 1\), got \(3,\)",
@@ -339,7 +339,7 @@ def test_conductances_that_depend_on_temperatures_and_states():
     assert np.allclose(mixed.vector_field([0.0, 0.0, np.log(2.0)])[2], -0.5 / 2.0, rtol=1e-14)
     cooling = lt.ComposedSystem([stone(), stone()], conductance=lambda T_a, T_b: -1.0 + 0.0 * T_a, validate=False)
     assert lt.integrate(cooling, x, (0.0, 1.0), 0.1, on_failure="return").status.code == "non_finite"
-    with pytest.raises(lt.InputError, match="meant for two bodies, not 3"):
+    with pytest.raises(lt.InputError, match="needs two bodies, got 3"):
         lt.ComposedSystem([stone() for _ in range(3)], conductance=law)
 
 

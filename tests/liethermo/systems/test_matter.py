@@ -145,11 +145,14 @@ def stone():
 
 
 test_bad_input = refusal_test(
-    (lambda: lt.Subsystem(None, 3, species=1), "wall that moves is a body of its own"),
+    (lambda: lt.Subsystem(None, 3, species=1), "wall that moves a body of its own"),
     (lambda: lt.ComposedSystem([stone(), stone()], membranes=[lt.Membrane(0, 1, 0.1)]), "has 0 kinds of particles"),
-    (lambda: lt.ComposedSystem([stone()], membranes=[lt.Membrane(0, 0, 0.1)]), "with itself"),
+    (
+        lambda: lt.ComposedSystem([stone()], membranes=[lt.Membrane(0, 0, 0.1)]),
+        "two bodies, got body 0 twice",
+    ),
     (lambda: lt.ComposedSystem([stone()], membranes=[lt.Membrane("top", 0, 0.1)]), "no body 'top'"),
-    (lambda: lt.ComposedSystem([stone()], reactions=[lt.Reaction(0, (-1, 1), 0.1)]), "0 stoichiometric numbers, not 2"),
+    (lambda: lt.ComposedSystem([stone()], reactions=[lt.Reaction(0, (-1, 1), 0.1)]), "0 stoichiometric numbers, got 2"),
     (lambda: lt.Membrane(0, 1, -0.1), "must be >= 0"),
     (lambda: lt.Reaction(0, (-1, 1), [0.1, 0.2]), "one number"),
 )

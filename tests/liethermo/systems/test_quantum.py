@@ -696,7 +696,7 @@ def test_an_ensemble_takes_matrices():
     matrices[1] *= 0.5  # a trace of a half
     many = lt.ensemble(q, matrices, (0.0, 0.2), 0.1)
     assert many.ok.tolist() == [True, False, True]
-    assert "trace 0.5, not 1" in many.message(1)
+    assert "trace 1, got 0.5" in many.message(1)
 
 
 @pytest.mark.slow
@@ -1038,10 +1038,10 @@ def test_a_ket_may_be_a_column():
         assert np.abs(q.state_array(given) - wanted).max() <= 1e-16
     many = q.state(np.stack([ket[:, None], [[1.0], [0.0]]]))
     assert np.abs(many - np.stack([wanted, q.state([1.0, 0.0])])).max() <= 1e-16
-    with pytest.raises(lt.InputError, match=r"the ket has the norm 2, not 1: divide it by that"):
+    with pytest.raises(lt.InputError, match=r"the ket must have norm 1, got 2. Divide the ket"):
         q.state([[2.0], [0.0]])
     with pytest.raises(
-        lt.InputError, match=r"has shape \(2, 2\), not \(3, 1\); a ket has the shape \(2,\) or \(2, 1\)"
+        lt.InputError, match=r"have shape \(2, 2\), got \(3, 1\); a ket has the shape \(2,\) or \(2, 1\)"
     ):
         q.state(np.ones((3, 1)))
 
@@ -1104,16 +1104,16 @@ BAD = {
     r"to a number >= 0: .*positional argument": lambda q: lt.ThermalJumps([(LOWER, lambda w: 1.0)]),
     r"got an array of float64, shape \(0, 0\)": lambda q: lt.QuantumSystem(np.zeros((0, 0))),
     "the observable must have shape": lambda q: q.expectation(q.state(RHO), np.eye(3)),
-    "mixed is a share": lambda q: q.state(RHO, mixed="half"),
-    "matrix is not Hermitian": lambda q: q.state(RHO + 0.1 * LOWER),
+    "mixed, .* from 0 to 1, got 'half'": lambda q: q.state(RHO, mixed="half"),
+    "matrix must be Hermitian": lambda q: q.state(RHO + 0.1 * LOWER),
     "least eigenvalue is": lambda q: q.state(np.diag([1.2, -0.2])),
-    "trace 0.7": lambda q: q.state(0.7 * RHO),
-    r"has shape \(2, 2\), not \(3, 3\)": lambda q: q.state(np.eye(3) / 3),
-    "not finite": lambda q: q.state(np.nan * RHO),
+    "trace 1, got 0.7": lambda q: q.state(0.7 * RHO),
+    r"have shape \(2, 2\), got \(3, 3\)": lambda q: q.state(np.eye(3) / 3),
+    "must be finite": lambda q: q.state(np.nan * RHO),
     "lt.QuantumSystem": lambda q: lt.LiePoissonSystem(
         mf.so(3), lt.Quadratic(np.ones(3)), lt.Quadratic(np.ones(3)), lt.SteepestEntropyAscent()
     ),
-    "whose product is not": lambda q: lt.QuantumSystem(QUBIT, parts=[3]),
+    "product of the sizes of the parts must be 2": lambda q: lt.QuantumSystem(QUBIT, parts=[3]),
 }
 
 
