@@ -14,8 +14,8 @@ from manifolds._pytree_module import forward_to
 from ..dissipation.factor import Factor, concatenate_factors
 from ..dissipation.noise import (
     FACTOR_SQUARE_CHECK,
-    factor_divergences,
     factor_check_residuals,
+    factor_divergences,
     generic_covectors,
     terms_with_factors,
     terms_with_factors_at_state,
