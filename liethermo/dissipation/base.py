@@ -26,7 +26,7 @@ from ..functions.energy import Energy
 from ..functions.indices import Indices, union_pattern
 from ..tracing.short_form import short_form
 from .factor import Factor, concatenate_factors
-from .geometry import Geometry, divergence_terms_of_fields
+from .geometry import Geometry, divergence_summands_of_fields
 
 LawName = Literal["conserved", "nondecreasing", "nonincreasing"]
 """Name of the law of a function: how a construction lets it change."""
@@ -181,7 +181,7 @@ class Dissipation(Module):
             assert B is not None
             return B.transpose_times(alpha)
 
-        return divergence_terms_of_fields(system, x, contract_columns)
+        return divergence_summands_of_fields(system, x, contract_columns)
 
     def factor_at_state(self, system: Geometry, x) -> Factor | None:
         """Return the factor B at x, by the exact gradients of the energy and of the preserved functions; or None."""

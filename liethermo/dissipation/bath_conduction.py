@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..functions.edges import graph_edges
-from ..functions.with_baths import temperature_slopes
+from ..functions.with_baths import temperature_derivatives_by_entropy
 from .bodies import HeatConduction
 
 
@@ -82,7 +82,7 @@ class BathConduction(HeatConduction):
 
         T' is the derivative of a temperature by its entropy, at constant conductances.
         """
-        slopes = temperature_slopes(system.energy, x, system.body_dim)
+        slopes = temperature_derivatives_by_entropy(system.energy, x, system.body_dim)
         if slopes is None:
             return jnp.zeros(len(self.conductance))
         i, j = np.asarray(self.first_bodies), np.asarray(self.second_bodies)

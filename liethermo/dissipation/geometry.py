@@ -126,7 +126,7 @@ def isotropic_vector(system: Geometry, x, w) -> jax.Array:
     return w if system.space is None else system.space.to_vector(system.space._isotropic(system.points(x), w))
 
 
-def divergence_terms_of_fields(system: Geometry, x, contract_fields) -> jax.Array:
+def divergence_summands_of_fields(system: Geometry, x, contract_fields) -> jax.Array:
     """Return the terms, shape (n, fields), whose sum over the first axis is the divergence of each vector field.
 
     ``contract_fields(y, alpha)`` is the product of a covector alpha at y with the field, or with each of several.

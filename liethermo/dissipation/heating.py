@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.frames import sqrt_or_zero
 from ..functions.indices import Indices
-from ..functions.with_baths import temperature_slopes
+from ..functions.with_baths import temperature_derivatives_by_entropy
 from .base import Dissipation, DissipationSum, LiftedDissipation, LiftedGeometry
 from .geometry import Geometry
 
@@ -87,7 +87,7 @@ class Heating(LiftedDissipation):
             return super().divergence(system, x)
         T = jnp.abs(self.values_at_sites(dH[n:]))
         body_divergence = jnp.zeros(B.size) if B.solenoidal else jnp.sqrt(T) * self.inner.divergence(body, x[:n])
-        slopes = temperature_slopes(system.energy, x, n)
+        slopes = temperature_derivatives_by_entropy(system.energy, x, n)
         if slopes is None:
             return body_divergence
         ratio = jnp.where(T > 0.0, 0.5 * self.values_at_sites(slopes) / jnp.where(T > 0.0, T, 1.0) ** 1.5, 0.0)

@@ -59,7 +59,7 @@ def terms_with_factors_at_state(dissipation: Dissipation, system: Geometry, x) -
     return terms_with_factors(dissipation, system, x, system.energy.gradient(x), dL)
 
 
-def factor_residuals(dissipation: Dissipation, system: Geometry, x) -> dict[str, jax.Array]:
+def factor_check_residuals(dissipation: Dissipation, system: Geometry, x) -> dict[str, jax.Array]:
     """Return, by name, how far the factors miss each of their properties at x, relative to the terms that cancel."""
     dH = system.energy.gradient(x)
     (generic,) = generic_covectors(x.shape[0], 1)

@@ -48,7 +48,7 @@ class _PointTimeFunction(Module):
 
 
 def flatten_site_functions(tree, shape: tuple[int, ...]):
-    """Return a pytree whose plain functions of states of this shape are made functions of flat states, shape (n,).
+    """Return a pytree with plain functions of states of this shape replaced by functions of flat states, shape (n,).
 
     Energies of other classes and Casimirs of algebras are functions of flat states already.
     """

@@ -47,13 +47,14 @@ def energy_in_component_order(energy: Energy, count: int) -> Energy:
             else:  # each term has a discrete gradient of its own
                 terms.append(PlanarSpinEnergy((term,)))
         else:
-            terms.append(_planar_term(term, count))
+            terms.append(_term_in_component_order(term, count))
     if spin_energies:
         terms.append(PlanarSpinEnergy(tuple(spin_energies)))
     return Sum.of(terms)
 
 
-def _planar_term(term: Energy, count: int) -> Energy:
+def _term_in_component_order(term: Energy, count: int) -> Energy:
+    """Return one summand of an energy as a function of states that are ordered component by component."""
     if isinstance(term, BodyBathsEnergy):
         return BodyBathsEnergy(energy_in_component_order(term.body, count), term.baths, term.body_dim, term.dim)
     if isinstance(term, Negative):

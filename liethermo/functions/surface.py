@@ -135,7 +135,7 @@ class ConstraintSurface:
         )
 
     def _constraint_change(self, x, compensation, d) -> jax.Array:
-        """Return the change of the constraints along d, by a quadrature that is exact for polynomials up to degree ten.
+        """Return the change of the constraints from x to x + d, by a quadrature that is exact up to degree ten.
 
         If its error exceeds rounding, in long steps with other constraints, the difference of values is returned.
         """

@@ -110,7 +110,7 @@ class BodyBathsEnergy(Energy):
         return BodyBathsEnergy(-self.body, -self.baths, self.body_dim, self.dim)
 
 
-def temperature_slopes(energy: Energy, x, body_dim: int) -> jax.Array | None:
+def temperature_derivatives_by_entropy(energy: Energy, x, body_dim: int) -> jax.Array | None:
     """Return the derivative of each bath's temperature by its entropy, shape (m,); None for constant temperatures.
 
     The first ``body_dim`` components belong to the body, the others to the baths.

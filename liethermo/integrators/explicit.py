@@ -372,7 +372,7 @@ class ExplicitMethod(TransportingMethod):
         )
 
     def _laws(self, system: System, leaf: bool = False) -> list[Law]:
-        """Return the functions whose levels a step ends on: first the conserved ones, then those that rise or fall.
+        """Return the functions onto whose levels steps are projected: first those conserved, then those with a sign.
 
         With ``leaf``, functions that are constant on a symplectic leaf are left out.
         """

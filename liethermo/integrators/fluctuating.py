@@ -14,8 +14,8 @@ from manifolds._pytree_module import forward_to
 from ..dissipation.factor import Factor, concatenate_factors
 from ..dissipation.noise import (
     FACTOR_SQUARE_CHECK,
+    factor_check_residuals,
     factor_divergences,
-    factor_residuals,
     generic_covectors,
     terms_with_factors,
     terms_with_factors_at_state,
@@ -266,4 +266,4 @@ def _noise_residuals_and_changes(system: System, x):
             jnp.max(jnp.abs(B.transpose_times(gradient)), initial=0.0),
             max_product * jnp.linalg.norm(gradient),
         )
-    return factor_residuals(system.dissipation, system, x)[FACTOR_SQUARE_CHECK], changes
+    return factor_check_residuals(system.dissipation, system, x)[FACTOR_SQUARE_CHECK], changes

@@ -308,7 +308,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         )
 
     def can_transport_attitude(self, system: System) -> bool:
-        """Return True if an attitude can follow the steps exactly, as it can if nothing is projected off the slopes."""
+        """Return whether the steps determine the attitude exactly: they do if nothing is projected off the slopes."""
         names = preserved_names(system)
         terms = terms_with_preserved_values(system.dissipations, names)
         has_only_quadratics = all(

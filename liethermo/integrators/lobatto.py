@@ -102,7 +102,7 @@ def _error_estimate(A: np.ndarray, b: np.ndarray, order: int, tree_vectors: list
 
 
 def _error_weights_and_order(A: np.ndarray, order: int, tree_vectors: list[np.ndarray]) -> tuple[np.ndarray, int]:
-    """Return the weights of an error estimate and their order q: they vanish on rooted trees of at most q nodes."""
+    """Return the weights of an error estimate, and its order q: it vanishes on rooted trees of at most q nodes."""
     vectors = rooted_tree_vectors(A, order - 1)
     for q in range(order - 1, 0, -1):
         conditions = np.array([v for n in range(1, q + 1) for v in vectors[n]])

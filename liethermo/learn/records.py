@@ -287,7 +287,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _checked_rows(owner: str, t: np.ndarray, x: np.ndarray, names: Sequence[str], is_whole: bool) -> Trajectory:
-    """Return the rows of one trajectory that have a value.
+    """Return one trajectory, without the rows of the record that are empty.
 
     Raises
     ------

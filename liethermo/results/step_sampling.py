@@ -47,7 +47,7 @@ class StepSample(NamedTuple):
 
 
 def sample_steps(system: System, x: np.ndarray, t: np.ndarray, h: np.ndarray, replay: Callable) -> StepSample:
-    """Return all steps of a run, or as many as are affordable, those with the fastest motion first.
+    """Return a sample of the steps of a run: all, or if these are too many, those with the fastest motion.
 
     Parameters
     ----------

@@ -161,6 +161,7 @@ class AdaptiveRun:
             self.event_set.raise_error()
 
     def record_ended_trajectories(self) -> None:
+        """Record the time of the event that ended the run, and the event functions that are undefined at its end."""
         if self._scalar("status") == StatusCode.EVENT:
             self.event_time = self._scalar("t")
         if self.event_set is not None:

@@ -29,7 +29,7 @@ from .noise import Fluctuations, NoisePaths, check_noise
 from .preparation import (
     check_choice,
     check_steps,
-    checked_method,
+    checked_or_default_method,
     initial_state,
     limit_family_to_span,
     limit_to_span,
@@ -128,7 +128,7 @@ def ensemble(
     ((100,), True)
     """
     start_time = time.perf_counter()
-    method = checked_method(method, noise)
+    method = checked_or_default_method(method, noise)
     outputs = outputs or ("final" if save_at is None else "trajectory")
     check_choice("outputs", outputs, ("final", "trajectory", "summary"))
     check_choice("engine", engine, ("auto", "array", "compiled"))

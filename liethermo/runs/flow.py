@@ -39,7 +39,13 @@ from ..tracing.programs import jit_cached, jit_unoptimised
 from .adaptive import Adaptive
 from .flow_derivatives import state_derivatives
 from .flow_times import checked_save_times, states_at_times, system_with_parameters
-from .preparation import checked_initial_state, checked_method, initial_state, limit_to_span, prepare_for_method
+from .preparation import (
+    checked_initial_state,
+    checked_or_default_method,
+    initial_state,
+    limit_to_span,
+    prepare_for_method,
+)
 from .schedule import StepSchedule, make_schedule
 
 
@@ -127,7 +133,7 @@ def flow(
     ... ).shape
     (3, 3)
     """
-    method = checked_method(method)
+    method = checked_or_default_method(method)
     system = system_with_parameters(system, parameters)
     _check_arguments(system, t_span, step)
     if save_at is not None and save_every is not None:

@@ -186,7 +186,7 @@ class _MemberFunctions:
         values_per_member = len(points) * len(functions_for_naming(self.member)) * self.member.dim
         return self._evaluate_in_batches(
             lambda rows: first_multiple_indices(
-                self._evaluate_at(_gradients_for_naming, rows, self._points_per_member(points, rows)), count
+                self._evaluate_at(_gradients_for_naming, rows, self._rescaled_points_per_member(points, rows)), count
             ),
             values_per_member,
         )
@@ -217,7 +217,10 @@ class _MemberFunctions:
         return self._evaluate_in_batches(
             lambda rows: is_momentum_map(
                 self._evaluate_at(
-                    _requested_casimir_residuals, rows, self._points_per_member(points, rows), self.requested_functions
+                    _requested_casimir_residuals,
+                    rows,
+                    self._rescaled_points_per_member(points, rows),
+                    self.requested_functions,
                 )
             ),
             values_per_member,
@@ -275,7 +278,7 @@ class _MemberFunctions:
         random = random_states(member, n_random_states(member))
         for points in (random[:1], random[1:]):  # one state is enough to see that a function is not conserved
             open_members = np.flatnonzero(~is_violated.all(axis=1))
-            try_states(open_members, functools.partial(self._points_per_member, points), len(points))
+            try_states(open_members, functools.partial(self._rescaled_points_per_member, points), len(points))
         if use_nearby_states:
             open_members = np.flatnonzero(~(is_defined | is_violated).all(axis=1))
             n_states = len(states_near(member, self.states[0]))
@@ -299,7 +302,7 @@ class _MemberFunctions:
             return type(values)(*(np.asarray(a).reshape(*leading, *np.shape(a)[1:]) for a in values))
         return np.asarray(values).reshape(*leading, *np.shape(values)[1:])
 
-    def _points_per_member(self, points: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    def _rescaled_points_per_member(self, points: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return random states for each member, shape (rows, points, n), from those of one member, shape (points, n).
 
         Entropies of baths are rescaled by the heat capacities of each member.

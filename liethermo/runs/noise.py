@@ -13,8 +13,8 @@ import numpy as np
 
 from manifolds._class_members import ListedType
 
-from ..dissipation.geometry import divergence_terms_of_fields
-from ..dissipation.noise import factor_residuals
+from ..dissipation.geometry import divergence_summands_of_fields
+from ..dissipation.noise import factor_check_residuals
 from ..errors import InputError
 from ..functions.energy import Energy, make_energy
 from ..integrators import MetriplecticMidpoint, OneStepMethod
@@ -244,12 +244,12 @@ def _noise_residuals(model: tuple[System, Energy | None], x):
     def motion(y):
         return system.poisson.sharp(y, system.energy.gradient(y))
 
-    terms = divergence_terms_of_fields(system, x, lambda y, alpha: jnp.dot(alpha, motion(y)))
+    terms = divergence_summands_of_fields(system, x, lambda y, alpha: jnp.dot(alpha, motion(y)))
     if density is not None:
         terms = jnp.append(terms, jnp.dot(density.gradient(x), motion(x)))
     scale = jnp.max(jnp.abs(terms)) + jnp.max(jnp.abs(motion(x))) / (1.0 + jnp.max(jnp.abs(x)))
     measure_residual = {MEASURE_ROW: jnp.abs(jnp.sum(terms)) / jnp.where(scale > 0.0, scale, 1.0)}
-    return factor_residuals(system.dissipation, system, x) | measure_residual
+    return factor_check_residuals(system.dissipation, system, x) | measure_residual
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ def check_choice(name: str, value, choices: tuple[str, ...]) -> None:
         raise InputError(f"{name} must be {', '.join(leading_choices)} or {last_choice}, got {value!r}")
 
 
-def checked_method(method, noise: Fluctuations | None = None, *, runs_alone: bool = False) -> Any:
+def checked_or_default_method(method, noise: Fluctuations | None = None, *, runs_alone: bool = False) -> Any:
     """Return the method of a run, the default one for None.
 
     Raises
@@ -227,7 +227,7 @@ def limit_to_span(system: System, schedule: StepSchedule) -> System:
 def limit_family_to_span(family: Family, system: System, schedule: StepSchedule) -> Family:
     """Return the family with each member limited to the span of a schedule; ``system`` is one of the members."""
     span = schedule.start, schedule.end, *schedule.breaks
-    return family.map_members_with_numbers(set_time_span, *span) if is_driven_run(system) else family
+    return family.map_members_with_shared_numbers(set_time_span, *span) if is_driven_run(system) else family
 
 
 def is_driven_run(system: System) -> bool:

@@ -28,7 +28,7 @@ from .ensemble import ensemble
 from .events import Until
 from .named_parameters import replace_parameters
 from .noise import Fluctuations, check_noise
-from .preparation import check_choice, check_steps, checked_method, has_undecided_invariants, refuse_tracers
+from .preparation import check_choice, check_steps, checked_or_default_method, has_undecided_invariants, refuse_tracers
 from .problem import Problem
 from .progress import Progress
 from .run import Run
@@ -104,7 +104,7 @@ class Propagator(metaclass=ListedType):
     ):
         if noise is not None:
             check_noise(noise)
-        method = checked_method(method, noise, runs_alone=True)
+        method = checked_or_default_method(method, noise, runs_alone=True)
         if not isinstance(system, System):
             raise InputError(
                 f"the first argument must be a system such as lt.LiePoissonSystem, got {type(system).__name__}"
@@ -225,7 +225,7 @@ class Propagator(metaclass=ListedType):
         functions = self._thread.final_functions
         function = functions.get(t_span) if type(t_span) is tuple else None
         if function is None:
-            function = self._final_state_function(t_span)
+            function = self._compiled_final_state_function(t_span)
             if type(t_span) is tuple and function is not None:
                 self._thread.add(t_span, function)
         if function is not None and (x := function(x0)) is not None:
@@ -306,7 +306,9 @@ class Propagator(metaclass=ListedType):
                 _schedules.get_or_compute(key, lambda: schedule)
         return schedule
 
-    def _final_state_function(self, t_span, varied: VariedParameters | None = None) -> FinalStateFunction | None:
+    def _compiled_final_state_function(
+        self, t_span, varied: VariedParameters | None = None
+    ) -> FinalStateFunction | None:
         """Return the function from x0 to the last state of runs over a span, which machine code computes.
 
         The result is None where a run has to compute the last state, and that of the function where a run has to say
@@ -363,7 +365,7 @@ class Propagator(metaclass=ListedType):
             return None
         function = thread.final_functions.get((names, key, t_span))
         if function is None:
-            function = self.with_parameters(parameters)._final_state_function(t_span, varied) or _leave_to_run
+            function = self.with_parameters(parameters)._compiled_final_state_function(t_span, varied) or _leave_to_run
             thread.add((names, key, t_span), function)
         return function(x0)
 

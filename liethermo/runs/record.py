@@ -228,7 +228,7 @@ class EnsembleRecord:
         return lambda: merge_evidence([collect() for collect in collectors])
 
     def _velocity_sources(self) -> dict[str, Callable[[], np.ndarray]]:
-        """Return the functions that compute the velocities, trajectories first, by their names."""
+        """Return functions that compute the velocities of all trajectories, by the names of the velocities."""
         if self.x is None and self.trajectories is None:
             return {}
         return {name: functools.partial(self._velocities, name) for name in self.member.velocity_functions}

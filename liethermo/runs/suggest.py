@@ -19,7 +19,7 @@ from ..integrators.taylor import order_for_tolerance
 from ..systems import System
 from .adaptive import Adaptive, make_step_control
 from .adaptive_run import AcceptedSteps, AdaptiveRun
-from .preparation import checked_initial_state, checked_method, prepare_for_method
+from .preparation import checked_initial_state, checked_or_default_method, prepare_for_method
 
 
 @with_library_settings
@@ -55,7 +55,7 @@ def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod |
     >>> bool(0.01 < step < 2.0)
     True
     """
-    return _try_method(system, x0, rtol, checked_method(method), t0).step
+    return _try_method(system, x0, rtol, checked_or_default_method(method), t0).step
 
 
 @dataclass(frozen=True)

@@ -186,7 +186,7 @@ class Family:
             return Family.from_arguments(annotate(self.common_system, *arguments), None)
         return self.map_members(annotate, *arguments)
 
-    def map_members_with_numbers(self, change: Callable[..., System], *numbers: float) -> Family:
+    def map_members_with_shared_numbers(self, change: Callable[..., System], *numbers: float) -> Family:
         """Return the family of the systems ``change(member, *numbers)``; the function ``change`` must be hashable.
 
         The numbers become parameters, so families with other numbers share the compiled program.

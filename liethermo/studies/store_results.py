@@ -46,7 +46,7 @@ def load_study(path: Any) -> xarray.Dataset:
 
 
 def open_results(path: Path, owner: object) -> xarray.Dataset:
-    """Return the results in a store; arrays that have not been read yet keep ``owner`` alive."""
+    """Return the results in a store; arrays are read at their first use, and keep ``owner`` alive until then."""
     store = StudyStore.open(path)
     import xarray
 

@@ -22,7 +22,7 @@ from ..results.audit import Audit
 from ..runs.adaptive import Adaptive
 from ..runs.events import Relaxed
 from ..runs.noise import Fluctuations, check_noise
-from ..runs.preparation import check_choice, checked_method
+from ..runs.preparation import check_choice, checked_or_default_method
 from ..runs.schedule import make_schedule
 from ..systems import System
 from . import files, identity
@@ -140,7 +140,7 @@ class Study(metaclass=ListedType):
         if shared_names := axis_names & {*self._measures}:
             raise InputError(f"{shared_names.pop()!r} names a measure and an axis; rename one of them")
         check_noise(noise)
-        method = checked_method(method, noise)
+        method = checked_or_default_method(method, noise)
         check_choice("engine", engine, ("auto", "array", "compiled"))
         if chunk is not None and (isinstance(chunk, bool) or not isinstance(chunk, int) or chunk < 1):
             raise InputError(f"chunk must be a positive integer, got {chunk!r}")
@@ -216,10 +216,12 @@ class Study(metaclass=ListedType):
         FileError
             If the store cannot be read or written, or another run works on it.
         """
-        store, axes = self._open_or_create_store()
+        store, axes = self._open_or_create_store_and_axes()
         is_interrupted = False
         with files.lock_store(store.root) as record_run:
-            store, axes = self._open_or_create_store()  # another run may have changed it before the lock was taken
+            store, axes = (
+                self._open_or_create_store_and_axes()
+            )  # another run may have changed it before the lock was taken
             files.remove_partial_files(store.root)
             if store.shape != axes.shape:
                 store = store.extend(axes)
@@ -292,7 +294,7 @@ class Study(metaclass=ListedType):
 
     # -- store and example ------------------------------------------------------------------------------------------
 
-    def _open_or_create_store(self) -> tuple[StudyStore, Axes]:
+    def _open_or_create_store_and_axes(self) -> tuple[StudyStore, Axes]:
         """Open or create the store, and return it with the axes in its order; a store of another study is refused."""
         if not self.store.exists() or (self.store.is_dir() and not any(self.store.iterdir())):
             solver, columns, x0 = self._solve_example()

@@ -74,7 +74,7 @@ class CheckReport(Tabular):
 def check_system(
     system: Any, points, samples: int, seed: int, scale: float, times=None, matrices: bool = True
 ) -> CheckReport:
-    """Test the axioms at states: see :meth:`liethermo.systems.base.System.check`.
+    """Test the axioms of a system at states and return a report: see :meth:`liethermo.systems.base.System.check`.
 
     Without ``matrices`` the tests of Pi and K are left out, for systems that satisfy them by construction.
     """

@@ -166,7 +166,7 @@ class SystemInterface(Geometry):
         return ""
 
     def run_conditions(self, x: np.ndarray, t: np.ndarray, guarantees: frozenset[str]) -> tuple[RunCondition, ...]:
-        """Return conditions of a run beside its laws, for the rows of an audit.
+        """Return conditions of a run beside its laws, such as positive density matrices, for the rows of an audit.
 
         Parameters
         ----------

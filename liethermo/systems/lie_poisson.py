@@ -376,7 +376,7 @@ def _casimirs_of_first(algebra: mf.LieAlgebra, names: tuple[str, ...] | None, n:
 def _casimirs_of_components(
     algebra: mf.LieAlgebra, names: tuple[str, ...] | None, indices: tuple[int, ...]
 ) -> frozenset[str]:
-    """Return the names of the leading Casimirs that depend on no components but those with the given indices."""
+    """Return the names of those leading Casimirs that depend only on the components with the given indices."""
     x, complement = np.random.default_rng(0).standard_normal(algebra.dim), np.delete(np.arange(algebra.dim), indices)
     with jax.ensure_compile_time_eval():
         casimirs = _leading_casimirs(algebra, names).items()

@@ -122,7 +122,7 @@ def counter_components(system: System) -> np.ndarray:
 
 
 def frozen_system(system: System, t: float | None) -> System:
-    """Return the system at a time; at no time if it does not depend on time.
+    """Return the system at the time t, or unchanged if it does not depend on time.
 
     Raises
     ------

@@ -340,7 +340,7 @@ class _DampingParts(NamedTuple):
 
 
 def _split_damping(dissipation: Dissipation | None) -> _DampingParts | None:
-    """Return the parts of a dissipation; None unless it is one damping, with heat conduction between baths or without.
+    """Return a dissipation as its damping and its heat conduction between baths, if any; None for another dissipation.
 
     It is None for subclasses, whose force may differ.
     """

@@ -47,7 +47,7 @@ from .transformations import (
     close_over_parameters,
     replace_parts,
     restrict_near_states,
-    split_in_halves,
+    sum_of_two_halves,
     transform_system,
 )
 
@@ -237,7 +237,7 @@ def check_halved_dissipation(case: RelationCase) -> SkipReason:
     """Check that a dissipation may be split into two with half of the rate each."""
     if case.system.dissipation is None:
         return "there is no dissipation"
-    run = case.run(replace_parts(case.system, dissipation=split_in_halves(case.system.dissipation)))
+    run = case.run(replace_parts(case.system, dissipation=sum_of_two_halves(case.system.dissipation)))
     case.compare_run("half of the rate, twice", run)
     rows, split_rows = ([row.law for row in s.audit().rows] for s in (case.base_run, run))
     case.suite.check_true(

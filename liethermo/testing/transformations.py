@@ -220,7 +220,7 @@ class _ScaledDissipation(LiftedDissipation):
         return None if velocity is None else self.fraction * velocity
 
 
-def split_in_halves(dissipation: Dissipation) -> Dissipation:
+def sum_of_two_halves(dissipation: Dissipation) -> Dissipation:
     """Return the dissipation as the sum of two with half of the rate each."""
     rate = getattr(dissipation, "rate", None)
     if isinstance(rate, jax.Array | np.ndarray | float):

@@ -123,10 +123,10 @@ def _run_program(program: TracedProgram, values: Sequence) -> list:
 
 
 def _run_forward_differentiable(program: TracedProgram, values: Sequence) -> list:
-    return _forward_differentiable(lambda *values: _run_program(program, values))(*values)
+    return _reverse_by_forward_mode(lambda *values: _run_program(program, values))(*values)
 
 
-def _forward_differentiable(function: Callable) -> Callable:
+def _reverse_by_forward_mode(function: Callable) -> Callable:
     """Return a function whose derivatives are computed in forward mode, also where JAX asks for reverse mode.
 
     A loop of unknown length cannot be differentiated in reverse mode. The tangent is the Jacobian, computed in forward
@@ -156,7 +156,7 @@ def _forward_differentiable(function: Callable) -> Callable:
             ]
             return sum(terms[1:], terms[0])
 
-        jacobians = _forward_differentiable(
+        jacobians = _reverse_by_forward_mode(
             lambda *inexact_arrays: jax.tree_util.tree_leaves(
                 jax.jacfwd(evaluate_inexact, tuple(range(len(inexact_indices))))(*inexact_arrays)
             )

@@ -121,7 +121,7 @@ class _KernelWriter:
             self._copy_output(0, a, n, n)
             self._copy_output_vector(1, w, n)
 
-        self._call_with_info("zheev" if is_complex else "dsyev", arguments, write_results)
+        self._call_and_write_results_or_nan("zheev" if is_complex else "dsyev", arguments, write_results)
 
     def _lu(self, m: int, n: int) -> None:
         a, n_pivots = self._copy_input(0, m, n), min(m, n)
@@ -160,11 +160,11 @@ class _KernelWriter:
                 self._allocate_doubles(work_size * self.parts_per_entry),
                 self._pointer_to_integer(work_size),
             ]
-            self._call_with_info(
+            self._call_and_write_results_or_nan(
                 "zgetri" if is_complex else "dgetri", invert_arguments, lambda: self._copy_output(0, a, n, n)
             )
 
-        self._call_with_info("zgetrf" if is_complex else "dgetrf", factorise_arguments, invert)
+        self._call_and_write_results_or_nan("zgetrf" if is_complex else "dgetrf", factorise_arguments, invert)
 
     def _qr(self, m: int, n: int, columns: int) -> None:
         n_reflectors, width, is_complex = min(m, n), max(n, columns), self.call.is_complex
@@ -236,7 +236,7 @@ class _KernelWriter:
             self._copy_output(1, u, m, n_left)
             self._copy_output(2, v, n_right, n)
 
-        self._call_with_info("zgesdd" if is_complex else "dgesdd", arguments, write_results)
+        self._call_and_write_results_or_nan("zgesdd" if is_complex else "dgesdd", arguments, write_results)
 
     # -- arrays -------------------------------------------------------------------------------------------------------
 
@@ -314,7 +314,7 @@ class _KernelWriter:
             declare_symbol(self.builder.module, name, ir.VoidType(), [a.type for a in arguments]), arguments
         )
 
-    def _call_with_info(self, name: str, arguments: Sequence[ir.Value], write_results) -> None:
+    def _call_and_write_results_or_nan(self, name: str, arguments: Sequence[ir.Value], write_results) -> None:
         """Call a routine whose last argument reports failure, then write its results, or NaN if it failed."""
         info = self._allocate_integers(1)
         self._call_routine(name, [*arguments, info])

@@ -101,7 +101,7 @@ class CompiledLoops:
         ] = []  # kept loaded, because a thread may be running any of them
 
     def loop_functions(self, n_steps: int, planned_steps: int = 0) -> tuple[Any, Any]:
-        """Return ``begin`` and ``advance``, compiled for ``n_steps`` more steps now and ``planned_steps`` later."""
+        """Return ``begin`` and ``advance``, optimised if ``n_steps`` now and ``planned_steps`` later are worth it."""
         if self._loaded and not self._loaded[-1][0].skip_optimisation:
             return self._loaded[-1][1:]
         with self._lock, report_compiler_faults():

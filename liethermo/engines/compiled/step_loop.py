@@ -220,7 +220,7 @@ class CompiledTrajectory:
         """
         saved, segments = np.empty(self._n_saved_values), tuple(segments)
         n_total, loop = sum(n_steps for _, n_steps in segments), self._loop
-        increments = [loop.noise_by_block(None, 1, n_steps) for _, n_steps in segments]
+        increments = [loop.noise_by_lane_block(None, 1, n_steps) for _, n_steps in segments]
         addresses = dict(zip(("parameters", "block", "n_done"), self._addresses, strict=True))
         fields = {"status": self._status, "h": self._h, "saved": saved}
         addresses |= {name: field.ctypes.data for name, field in fields.items()}
@@ -244,7 +244,7 @@ class CompiledTrajectory:
 
     def _take_steps(self, h: float, n_saves: int, steps_per_save: int, noise: np.ndarray | None, out) -> None:
         n_steps = n_saves * steps_per_save
-        increments = self._loop.noise_by_block(None if noise is None else noise[None], 1, n_steps)
+        increments = self._loop.noise_by_lane_block(None if noise is None else noise[None], 1, n_steps)
         parameters, block, n_done = self._addresses
         self._h[0], self._n_done[0] = h, 0
         _, advance = self._loop.loop_functions(n_steps)
@@ -554,7 +554,7 @@ class CompiledStepLoop:
             n_saves,
             steps_per_save,
         ]
-        increments = self.noise_by_block(noise, n_blocks, n_saves * steps_per_save)
+        increments = self.noise_by_lane_block(noise, n_blocks, n_saves * steps_per_save)
         arguments += [out.ctypes.data, n_saves * steps_per_save, increments.ctypes.data]
         newton_address = self.newton_address(is_needed=False)
         _, advance = self._loops.loop_functions(n_blocks * n_saves * steps_per_save)
@@ -578,7 +578,7 @@ class CompiledStepLoop:
         """Number of values of a trajectory at each save."""
         return sum(self._layout.row_counts[name] for name in self.saved_fields)
 
-    def noise_by_block(self, noise: np.ndarray | None, n_blocks: int, n_steps: int) -> np.ndarray:
+    def noise_by_lane_block(self, noise: np.ndarray | None, n_blocks: int, n_steps: int) -> np.ndarray:
         """Rearrange noise increments to the order of the loop, shape (blocks, steps, increments, lanes)."""
         n_increments = self._shapes["dW"][0]
         if not n_increments:

@@ -104,7 +104,7 @@ class SparseEngine:
     # -- Newton's method ------------------------------------------------------------------------------------------
 
     def _solve_newton(self, state: State, h, n_fixed_point: int) -> StageSolution:
-        k, residual, scale = _best_guess_residual_and_scale(self.system, self.method, state, h)
+        k, residual, scale = _best_guess_with_residual_and_scale(self.system, self.method, state, h)
         s, needs_jacobian = IterationState.initial(k), float(h) != self._factored_step_size
         slope_rounding = jnp.zeros(())
         while (
@@ -239,7 +239,7 @@ def _residual_rounding_scale(system: System, method: OneStepMethod, x) -> Any:
 
 
 @jit_cached
-def _best_guess_residual_and_scale(system: System, method: OneStepMethod, state: State, h):
+def _best_guess_with_residual_and_scale(system: System, method: OneStepMethod, state: State, h):
     """Return the predicted slopes, or zero slopes if their residual is smaller, with residual and scale."""
     residual_function, guess, scale = _weighted_residual_guess_and_scale(system, method, state, h)
     k, residual = best_guess_and_residual(residual_function, guess)

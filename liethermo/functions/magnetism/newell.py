@@ -26,7 +26,7 @@ FAR_NODES = ((12.0, 6), (24.0, 5), (40.0, 4), (np.inf, 3))
 
 
 def demagnetising_tensors(cells: tuple[int, ...], size: np.ndarray) -> np.ndarray:
-    """Return N between a cell and those at offsets (i, j, k) >= 0, shape (6, nx, ny, nz): xx, xy, xz, yy, yz, zz.
+    """Return the demagnetising tensor between a cell and those at offsets (i, j, k) >= 0, shape (6, nx, ny, nz).
 
     Parameters
     ----------
