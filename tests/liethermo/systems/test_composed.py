@@ -364,7 +364,7 @@ def test_fourier_factors_as_they_are_printed():
         assert system.entropy_law == {"midpoint": None, "discrete": "nondecreasing"}[conduction]
     assert np.abs(ends["midpoint"] - expected).max() < 1e-13
     assert 1e-5 < np.abs(ends["discrete"] - expected).max() < 1e-3
-    with pytest.raises(lt.InputError, match="conduction is"):
+    with pytest.raises(lt.InputError, match="conduction must be"):
         lt.ComposedSystem(bodies, conductance=1.0, conduction="middle")
 
 
