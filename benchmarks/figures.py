@@ -80,7 +80,7 @@ def draw_time_ratios(themes: dict[str, list[PeerComparison]], path: Path) -> Non
                     labelled.add(peer)
             height += 1.1
         ratios = [c.ratio for comparisons in themes.values() for c in comparisons]
-        limits = min(ratios) / 1.5, 1.5 * max(ratios)
+        limits = min(ratios, default=1.0) / 1.5, 1.5 * max(ratios, default=1.0)  # without peers there is no ratio
         axes.set(xscale="log", xlim=limits, ylim=(height - 0.4, -0.6))
         axes.set_xlabel(
             "← liethermo is faster   ·   the other is faster →\ntime of liethermo / time of the other program"
@@ -90,7 +90,8 @@ def draw_time_ratios(themes: dict[str, list[PeerComparison]], path: Path) -> Non
         axes.axvspan(limits[0], 1.0, color="0.96", zorder=-1)
         axes.set_yticks([])
         axes.spines[["top", "right", "left"]].set_visible(False)
-        figure.legend(frameon=False, loc="outside upper left", ncols=4, handletextpad=0.0, columnspacing=0.8)
+        if labelled:
+            figure.legend(frameon=False, loc="outside upper left", ncols=4, handletextpad=0.0, columnspacing=0.8)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, metadata={"Date": None})
         plt.close(figure)
