@@ -93,6 +93,13 @@ class IterationState(NamedTuple):
         is_small = self.is_small(scale, options, residual_norm, slope_rounding)
         return (self.update <= options.update_floor * scale) | ((self.n_stalled >= 2) & is_small)
 
+    def has_converged_or_ended_small(
+        self, is_at_limit, scale, options: SolverOptions, residual_norm, slope_rounding
+    ) -> jax.Array:
+        """Return whether a Newton iteration has converged; at its limit the update may still shrink below rounding."""
+        criteria = scale, options, residual_norm, slope_rounding
+        return self.is_at_plateau(*criteria) | (is_at_limit & self.is_small(*criteria))
+
     def has_converged_and_continues(self, scale, options: SolverOptions) -> tuple[jax.Array, jax.Array]:
         """Return whether a fixed-point iteration has converged, and whether it goes on."""
         is_slow = (
@@ -171,9 +178,9 @@ def solve_newton(
         return is_at_limit(s, is_damped) | ~jnp.isfinite(jnp.sum(s.k))
 
     def is_unsolved(s: IterationState, residual, is_damped):
-        """Return whether the iteration has not converged; at the limit it may still shrink below rounding."""
-        criteria = scale(s.k), options, norm(residual), slope_rounding
-        converged = s.is_at_plateau(*criteria) | (is_at_limit(s, is_damped) & s.is_small(*criteria))
+        converged = s.has_converged_or_ended_small(
+            is_at_limit(s, is_damped), scale(s.k), options, norm(residual), slope_rounding
+        )
         return jnp.logical_not(is_solved) & ~converged
 
     def damp_newton_step(k, step, residual_norm, smallest_step_norm, is_damped):

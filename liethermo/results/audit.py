@@ -374,7 +374,7 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
         change = invariant_drift.change
         if name in laws.conserved:
             drifts.append(change)
-            rows.append(invariant_row(f"drift of {name}", invariant_drift, tolerances))
+            rows.append(invariant_row(name, invariant_drift, tolerances))
         elif name in laws.unpromised:
             rows.append(AuditRow(f"drift of {name}", change, None, None, UNPROMISED_CONSTANT_NOTE))
         else:
@@ -421,9 +421,9 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
     )
 
 
-def invariant_row(law: str, drift: InvariantDrift, tolerances: Tolerances, note: str = "") -> AuditRow:
-    """Return the row of a function that is conserved, the entropy or another one."""
-    return _judged_row(law, drift.change, drift.allowed_change(tolerances.casimirs), note)
+def invariant_row(name: str, drift: InvariantDrift, tolerances: Tolerances) -> AuditRow:
+    """Return the row of a function that is conserved."""
+    return _judged_row(f"drift of {name}", drift.change, drift.allowed_change(tolerances.casimirs))
 
 
 def _spatial_momentum_row(change: float, laws: Laws, tolerances: Tolerances) -> AuditRow:

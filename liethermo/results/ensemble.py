@@ -335,7 +335,7 @@ class Ensemble(AuditableResult):
         checks = check_laws(self, self.laws, limits, self.evidence.terms, self.entropy is not None)
         worst = [(check, int(np.argmax(check.excess))) for check in checks]
         *rows, residual_row = (check.audit_row(i, f"worst is trajectory {i}") for check, i in worst)
-        rows += [invariant_row(f"drift of {name}", drift, limits) for name, drift in drifts.items()]
+        rows += [invariant_row(name, drift, limits) for name, drift in drifts.items()]
         rows += [residual_row, *condition_rows(self.evidence)]
         if self.evidence_source is not None or self.evidence.local_error is not None:
             rows.append(accuracy_row(self.evidence, limits))

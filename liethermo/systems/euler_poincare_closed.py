@@ -23,8 +23,7 @@ from ..tracing.traced import trace_callables
 from .body_states import checked_velocity, is_given_by_velocity
 from .euler_poincare import require_regular
 from .ledger import LedgerSystem
-from .lie_poisson import is_body_algebra
-from .torque import begins_with_rotations
+from .lie_poisson import body_velocity_slices
 
 
 class EulerPoincareClosedSystem(LedgerSystem):
@@ -154,10 +153,7 @@ class EulerPoincareClosedSystem(LedgerSystem):
 
     @property
     def velocity_functions(self):
-        if not begins_with_rotations(self.algebra):
-            return {}
-        functions, n = {"angular_velocity": lambda x: x[:3]}, self.algebra.dim
-        return functions | ({"rotor_rates": lambda x: x[3:n]} if is_body_algebra(self.algebra) and n > 3 else {})
+        return {name: lambda x, part=part: x[part] for name, part in body_velocity_slices(self.algebra).items()}
 
     def temperature_at(self, y) -> jax.Array:
         return -jax.grad(self.lagrangian, argnums=1)(y[:-1], y[-1])

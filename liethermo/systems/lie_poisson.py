@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import equinox as eqx
 import jax
@@ -154,20 +154,15 @@ class LiePoissonSystem(TorqueSystem):
 
     @property
     def inertia(self) -> np.ndarray | None:
-        if not is_body_algebra(self.algebra) or is_traced(self.energy) or self.energy.depends_on_time:
+        if not _is_body_algebra(self.algebra) or is_traced(self.energy) or self.energy.depends_on_time:
             return None
         energy = self.drop_baths().energy
         return _inertia_tensor(energy, self.algebra.dim) if energy.is_quadratic else None
 
     @property
     def velocity_functions(self):
-        if not begins_with_rotations(self.algebra):
-            return {}
-        functions = {"angular_velocity": lambda x: self.energy.gradient(x)[:3]}
-        n = self.algebra.dim
-        if n > 3 and is_body_algebra(self.algebra):
-            functions["rotor_rates"] = lambda x: self.energy.gradient(x)[3:n]
-        return functions
+        parts = body_velocity_slices(self.algebra)
+        return {name: lambda x, part=part: self.energy.gradient(x)[part] for name, part in parts.items()}
 
     def state(
         self, x=None, batch: bool = False, *, angular_velocity=None, rotor_rates=None, temperature=None, t=None
@@ -343,7 +338,16 @@ def _gradient_and_hessian(energy: Energy, x) -> tuple[jax.Array, jax.Array]:
 
 
 @functools.lru_cache(maxsize=64)
-def is_body_algebra(algebra: mf.LieAlgebra) -> bool:
+@functools.lru_cache(maxsize=64)
+def body_velocity_slices(algebra: mf.LieAlgebra) -> Mapping[str, slice]:
+    """Return where a velocity of the algebra holds those of a rigid body and of its rotors, by name; empty without."""
+    if not begins_with_rotations(algebra):
+        return {}
+    has_rotors = algebra.dim > 3 and _is_body_algebra(algebra)
+    return {"angular_velocity": slice(3)} | ({"rotor_rates": slice(3, algebra.dim)} if has_rotors else {})
+
+
+def _is_body_algebra(algebra: mf.LieAlgebra) -> bool:
     """Return whether the algebra is so(3), or its direct sum with an abelian algebra of internal parts."""
     return algebra.dim >= 3 and _extends_algebra(mf.so(3), algebra)
 

@@ -149,9 +149,11 @@ class SparseEngine:
 
     @staticmethod
     def _has_converged(s: IterationState, scale, residual, slope_rounding) -> bool:
-        criteria = scale, SPARSE_SOLVER_OPTIONS, jnp.max(jnp.abs(residual)), slope_rounding
-        is_at_limit = int(s.n_iterations) >= SPARSE_SOLVER_OPTIONS.max_newton_iterations
-        return bool(s.is_small(*criteria) if is_at_limit else s.is_at_plateau(*criteria))
+        is_at_limit = s.n_iterations >= SPARSE_SOLVER_OPTIONS.max_newton_iterations
+        residual_norm = jnp.max(jnp.abs(residual))
+        return bool(
+            s.has_converged_or_ended_small(is_at_limit, scale, SPARSE_SOLVER_OPTIONS, residual_norm, slope_rounding)
+        )
 
     def _damped_newton_step(
         self, state, h, s: IterationState, residual, scale, inverse: SparseInverse, max_trials: int
