@@ -56,7 +56,7 @@ class AcceptedSteps(NamedTuple):
 
 
 class AdaptiveRun:
-    """Run of one trajectory in which every step is examined, and its self.
+    """A run of one trajectory in which every step is examined, with its last state and the reason why it ended.
 
     Parameters
     ----------
