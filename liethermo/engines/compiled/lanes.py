@@ -50,7 +50,7 @@ class CompiledAdaptiveRuns:
     parameters : array, shape (p,) or (trajectories, p)
     x : array, shape (trajectories, n)
     t, stop_time, span_length : float
-        See :func:`..step_control.initial_adaptive_state`.
+        See :func:`..adaptive_steps.initial_adaptive_state`.
     """
 
     def __init__(
