@@ -10,7 +10,7 @@ import importlib.metadata
 import warnings
 
 import manifolds  # noqa: F401  (switches 64-bit mode on before anything is traced)
-from manifolds._names import public_dir
+from manifolds._arguments import public_dir
 
 from . import (
     _class_members,  # noqa: F401  (what help() lists of the classes)
@@ -20,19 +20,14 @@ from . import (
 )
 from .dissipation.adiabatic import AdiabaticJumps
 from .dissipation.base import Dissipation
-from .dissipation.bath_conduction import BathConduction
-from .dissipation.double_bracket import DoubleBracket
+from .dissipation.brackets import DoubleBracket, FourBracket, InnerProductDissipation, KillingDissipation
 from .dissipation.factor import Factor
-from .dissipation.force import EulerPoincareForce
-from .dissipation.four_bracket import FourBracket
-from .dissipation.friction import Friction
-from .dissipation.friction_operator import FrictionOperator
-from .dissipation.inner_product import InnerProductDissipation, KillingDissipation
+from .dissipation.friction import EulerPoincareForce, Friction, FrictionOperator
+from .dissipation.heating import BathConduction
 from .dissipation.landau_lifshitz import LandauLifshitz
 from .dissipation.lindblad import LindbladJumps
-from .dissipation.local_metric import LocalProjectedMetric
 from .dissipation.potential import ActivatedFriction, CoulombFriction, DissipationPotential, PowerLawFriction
-from .dissipation.projected_metric import ProjectedMetric
+from .dissipation.projected_metric import LocalProjectedMetric, ProjectedMetric
 from .dissipation.quantum import ThermalJumps
 from .dissipation.steepest_ascent import SteepestEntropyAscent
 from .errors import (

@@ -6,7 +6,7 @@ axes to axes in space [:doc:`/reference/conventions`].
 
 from __future__ import annotations
 
-from manifolds._names import public_dir
+from manifolds._arguments import public_dir
 
 from .models.bodies_on_ground import BodiesOnGround
 from .models.free_motion import Periods, damping_time, periods, rate_of

@@ -7,11 +7,10 @@ round them away.
 import importlib
 
 from . import _fork_guard, _precision, testing  # noqa: F401
-from ._names import public_dir
+from ._arguments import public_dir
 from .algebras.blocks import DirectSum, power
 from .algebras.casimirs import NoPolynomialCasimirWarning
 from .algebras.catalogue import abelian, aff, bianchi, g2, galilei, gl, heisenberg, registered, se, sl, so, sp, su, u
-from .algebras.formula import Formula
 from .algebras.invariants import TracePolynomial
 from .algebras.isomorphism_type import IsomorphismType
 from .algebras.killing import trilinear_form
@@ -19,7 +18,7 @@ from .algebras.lie_algebra import LieAlgebra
 from .algebras.magnetic import MagneticExtension, magnetic_extension
 from .algebras.matrix_algebra import MatrixAlgebra, MatrixTrace
 from .algebras.patera import patera
-from .algebras.polynomial import Polynomial
+from .algebras.polynomial import Formula, Polynomial
 from .algebras.sums import direct_sum, semidirect_sum
 from .errors import (
     AntisymmetryError,
@@ -47,13 +46,15 @@ from .retractions.charts import (
     EuclideanRetraction,
     GroupRetraction,
     MidpointRetraction,
+    PolarRetraction,
     ProjectionRetraction,
+    QRRetraction,
     RiemannianRetraction,
+    StiefelCayleyRetraction,
     retraction,
 )
 from .retractions.coordinates import Coordinates, Place, coordinates_around
 from .retractions.retraction import Chart, Retraction
-from .retractions.stiefel_charts import PolarRetraction, QRRetraction, StiefelCayleyRetraction
 from .spaces import (
     SPD,
     Correlation,
@@ -86,9 +87,16 @@ from .structures.contact import (
     LagrangianContact,
     SplitContact,
 )
-from .structures.density import DensityMatrices
-from .structures.extended import ExtendedPhaseSpace
-from .structures.poisson import Canonical, LiePoisson, NoPoisson, PoissonMap, PoissonStructure, PoissonTensor
+from .structures.poisson import (
+    Canonical,
+    DensityMatrices,
+    ExtendedPhaseSpace,
+    LiePoisson,
+    NoPoisson,
+    PoissonMap,
+    PoissonStructure,
+    PoissonTensor,
+)
 from .structures.spins import Spins
 
 __all__ = [

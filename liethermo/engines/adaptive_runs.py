@@ -22,13 +22,13 @@ from .adaptive_steps import (
     initial_adaptive_state_program,
 )
 from .array_engine import LazyNewton
-from .compiled.lanes import CompiledAdaptiveRuns
+from .compiled.engine import CompiledAdaptiveRuns
 from .compiled.parameters import ProgramStructure
-from .growth_rate import DENSE_JACOBIAN_DIM
 from .solver_options import DEFAULT_OPTIONS, EPS
 from .status_codes import StatusCode
 from .step import State
 from .step_control import (
+    DENSE_JACOBIAN_DIM,
     AdaptiveState,
     StepControl,
     largest_growth_rate_by_arnoldi,

@@ -3,7 +3,7 @@
 An adaptive run carries an :class:`.AdaptiveState`. One attempt takes a step, estimates its error, and chooses the size
 of the next step. The run pauses when the host has to act: at a stop time, if the growth rate must be computed, and at a
 possible event. A step in which the event function changes its sign is repeated with shorter sizes, until it ends at
-the sign change: at a zero, which is an event, or at a jump (:meth:`.lanes.PauseHandler.decide_sign_changes`).
+the sign change: at a zero, which is an event, or at a jump (:meth:`.engine.PauseHandler.decide_sign_changes`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from ..systems import System
 from ..systems.clock import system_of_step
 from ..tracing.programs import jit_cached
 from . import root_bracket
-from .growth_rate import jacobian_probe
 from .solver_options import DEFAULT_OPTIONS, EPS, SolverOptions
 from .stage_solver import keep_fixed_point_result
 from .status_codes import StatusCode
@@ -32,6 +31,7 @@ from .step_control import (
     TRUNCATED_STEP_RATIO,
     AdaptiveState,
     StepControl,
+    jacobian_probe,
     limit_next_step_by_growth_rate,
     next_step_size_and_end,
     step_size_after_acceptance,

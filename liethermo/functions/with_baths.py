@@ -8,10 +8,9 @@ import jax.numpy as jnp
 import scipy
 
 from .bath_energy import keeps_temperatures
-from .coordinates import Components
 from .energy import Energy, Pullback
 from .frames import sum_terms
-from .indices import pattern_of_matrix
+from .indices import Components, pattern_of_matrix
 from .path import CollocationPath
 
 

@@ -18,8 +18,7 @@ from ..functions.energy import Energy as AnyEnergy
 from ..functions.energy import Pullback, make_energy
 from ..systems import MetriplecticSystem, System
 from .data import DataScales
-from .networks import Network, learned_mask
-from .parts import Energy, Entropy, Friction, Poisson, extend_poisson
+from .parts import Energy, Entropy, Friction, Network, Poisson, extend_poisson, learned_mask
 
 T = TypeVar("T", bound=System)
 

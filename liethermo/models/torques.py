@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._arguments import public_dir
 from manifolds._arrays import is_traced
-from manifolds._names import public_dir
 from manifolds._pytree_module import Module
 
 from ..errors import InputError

@@ -17,9 +17,8 @@ from ..runs.events import Relaxed
 from ..studies.axes import Zipped, latin_hypercube, sobol, zipped
 from ..studies.measures import At
 from ..studies.study import Study
-from .messages import format_value, suggest_match
 from .reading import Spec
-from .schema import EvenlySpacedAxis, MeasureTable, SampledAxis
+from .schema import EvenlySpacedAxis, MeasureTable, SampledAxis, format_value, suggest_match
 
 INITIAL_STATE_KEY = "initial"
 """Name of the initial state among the parameters that an axis can vary."""

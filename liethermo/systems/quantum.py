@@ -34,9 +34,8 @@ from ..functions.with_baths import BodyBathsEnergy
 from .base import System
 from .baths import BathEntropy, HeatBaths, poisson_with_baths
 from .conditions import RunCondition
-from .density_states import checked_density_matrices, checked_parts, join_baths, tensor_with_identity
 from .equilibria import Equilibrium, steady_state
-from .hamiltonian import hamiltonian_energy
+from .hamiltonian import checked_density_matrices, checked_parts, hamiltonian_energy, join_baths, tensor_with_identity
 from .interface import EngineHints, InvariantVerdicts
 from .invariants import systems_at_test_times
 from .states import evaluate_batch

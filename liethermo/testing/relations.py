@@ -39,7 +39,7 @@ from ..studies.axes import replicas
 from ..studies.study import Study
 from ..systems import LiePoissonSystem, System
 from ..tracing.scalarize import UnsupportedPrimitive
-from .runs import N_STEPS, check_completion, default_step, random_start
+from .suites import N_STEPS, check_completion, default_step, random_start
 from .transformations import (
     CoordinateChange,
     UncoupledPair,

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
+from .._arguments import check_memory, checked_size
 from .._arrays import numeric_array, real_components
 from .._pytree_module import forward_to
-from .._sizes import check_memory, checked_size
 from ..errors import LieAlgebraError, ParameterError, ShapeError
-from ..matrices.blocks import BlockDiagonal
+from ..matrices.linear import BlockDiagonal
 from .bracket_algebra import BracketAlgebra
 from .lie_algebra import LieAlgebra
 from .polynomial import Polynomial

@@ -17,9 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..errors import LieAlgebraError, ParameterError, warn
-from .formula import Formula
 from .invariants import TracePolynomial, fundamental_invariants
-from .polynomial import Polynomial
+from .polynomial import Formula, Polynomial
 from .polynomial_casimirs import TooLargeError, casimir_count, new_casimirs
 from .structure import AlgebraStructure
 

@@ -24,10 +24,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._arguments import checked_names
 from .._arrays import real_components
-from .._names import checked_names
 from ..errors import LieAlgebraError, ShapeError
-from ._null_space import numerical_null_space
+from ._subspaces import numerical_null_space
 from .polynomial import Polynomial
 from .polynomial_casimirs import casimir_count, new_casimirs
 from .structure import AlgebraStructure

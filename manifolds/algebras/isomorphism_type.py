@@ -15,8 +15,7 @@ import numpy as np
 
 from ..errors import LieAlgebraError
 from . import _solvable_types as solvable
-from ._jordan import distinct_eigenvalues
-from ._solvable_types import Summand
+from ._solvable_types import Summand, distinct_eigenvalues
 from ._subspaces import complement, coordinates, intersection, is_exact, null_space, products, row_space
 from .lie_algebra import LieAlgebra
 from .patera import CATALOGUE, patera

@@ -12,7 +12,7 @@ import numpy as np
 
 from .._arrays import real_components
 from ..errors import ParameterError
-from ..matrices.blocks import BlockDiagonal, Diagonal
+from ..matrices.linear import BlockDiagonal, Diagonal
 from .blocks import DirectSum
 from .bracket_algebra import BracketAlgebra
 from .lie_algebra import LieAlgebra

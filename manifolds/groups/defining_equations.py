@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._sizes import checked_size
-from ..algebras._null_space import RANK_TOLERANCE, numerical_null_space
+from .._arguments import checked_size
+from ..algebras._subspaces import RANK_TOLERANCE, numerical_null_space
 from ..algebras.lie_algebra import LieAlgebra
 from ..errors import ClosureError, ParameterError
 from ..matrices.linear import solve

@@ -29,7 +29,7 @@ from ..matrices.stumpff import HALF_TURN_MARGIN
 from . import closed_forms as closed
 from . import maps
 from .defining_equations import fields_from_equations
-from .products import product_fields
+from .maps import product_fields
 
 MEMBERSHIP_TOLERANCE = 1e-8
 """Largest distance of a matrix from the group, relative to its size, at which its logarithm is taken."""

@@ -9,13 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._arguments import checked_size
 from .._pytree_module import forward_to
-from .._sizes import checked_size
 from ..errors import SpaceError
 from .base import Space, random_key, register, register_result_class
-from .euclidean import Euclidean
+from .constant_curvature import Euclidean, Sphere
 from .groups import SpecialOrthogonal
-from .sphere import Sphere
 
 
 @register_result_class("_product")

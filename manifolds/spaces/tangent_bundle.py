@@ -11,7 +11,7 @@ from .._pytree_module import forward_to
 from ..errors import SpaceError
 from ..matrices.linear import solve_near_identity
 from .base import Space, random_key, register
-from .sphere import Sphere
+from .constant_curvature import Sphere
 
 
 @register((Sphere(2),))

@@ -7,20 +7,112 @@ arrays among its leaves) stay arguments: a sweep compiles once. Machine code is 
 
 from __future__ import annotations
 
+import ctypes
 import functools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
+from llvmlite import ir
 
 from ...integrators import OneStepMethod
 from ...systems import System
+from ...tracing.scalarize import UnsupportedPrimitive
 from ..array_engine import max_saves_per_call
 from ..solver_options import DEFAULT_OPTIONS, SolverOptions
 from ..step import SavedStates, State
 from ..step_control import StepControl
+from .llvm_writer import FLOAT64, INT64, ProgramWriter
+from .loop_codegen import ADVANCE_TYPE, BEGIN_TYPE, FLOAT64_POINTER, INT64_POINTER
+from .machine_code import MachineCode
 from .parameters import ProgramStructure, flat_parameters
-from .short_run import ShortRun
 from .step_loop import CompiledStepLoop, cached_step_loop
+
+FIELD_TYPES = {
+    "begin": BEGIN_TYPE.as_pointer(),
+    "advance": ADVANCE_TYPE.as_pointer(),
+    "parameters": FLOAT64_POINTER,
+    "block": FLOAT64_POINTER,
+    "n_done": INT64_POINTER,
+    "status": FLOAT64_POINTER,
+    "h": FLOAT64_POINTER,
+    "saved": FLOAT64_POINTER,
+    "newton": ADVANCE_TYPE.args[-1],
+    "sizes": FLOAT64_POINTER,
+    "counts": INT64_POINTER,
+    "increments": FLOAT64_POINTER.as_pointer(),
+    "n_segments": INT64,
+}
+"""Fields of the description of a run: the arguments of ``begin`` and ``advance``, and arrays with an entry for each
+segment of equal steps."""
+
+RUN_SIGNATURE = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)
+"""C signature of ``run(description)``."""
+
+
+class ShortRun:
+    """All steps of a run of one trajectory by one call, which returns whether they were taken.
+
+    Parameters
+    ----------
+    addresses : dict from str to int
+        The fields ``parameters``, ``block``, ``n_done``, ``status``, ``h`` and ``saved`` of :data:`FIELD_TYPES`.
+    segments : sequence of (h, n_steps)
+    increments : sequence of array
+        Increments of noise for each segment.
+    """
+
+    def __init__(
+        self, addresses: dict[str, int], segments: Sequence[tuple[float, int]], increments: Sequence[np.ndarray]
+    ):
+        sizes, counts = np.array([h for h, _ in segments]), np.array([n_steps for _, n_steps in segments])
+        pointers = np.array([array.ctypes.data for array in increments])
+        self._arrays = sizes, counts, increments, pointers
+        arrays = {"sizes": sizes, "counts": counts, "increments": pointers}
+        self._fields = np.zeros(len(FIELD_TYPES), dtype=np.int64)
+        known = addresses | {name: array.ctypes.data for name, array in arrays.items()} | {"n_segments": len(sizes)}
+        for name, value in known.items():
+            self._fields[list(FIELD_TYPES).index(name)] = value
+        self._newton = list(FIELD_TYPES).index("newton")
+        self._functions: tuple[Any, ...] = ()
+        self._address, self._run = self._fields.ctypes.data, RUN_SIGNATURE(_run_code().function_address("run"))
+
+    def __call__(self, functions: tuple[Any, Any], newton_address: int) -> bool:
+        """Take all steps by ``begin`` and ``advance``; return False if one fails or needs Newton's method."""
+        if functions != self._functions:
+            self._functions = functions
+            self._fields[:2] = [ctypes.cast(function, ctypes.c_void_p).value or 0 for function in functions]
+        if newton_address:
+            self._fields[self._newton] = newton_address
+        return not self._run(self._address)
+
+
+@functools.cache
+def _run_code() -> MachineCode:
+    """Compile ``run(description)``, which returns 1 if a step fails or needs Newton's method, and otherwise 0."""
+    module = ir.Module("run")
+    description = ir.LiteralStructType(FIELD_TYPES.values()).as_pointer()
+    function = ir.Function(module, ir.FunctionType(INT64, [description]), "run")
+    writer = ProgramWriter(ir.IRBuilder(function.append_basic_block("entry")), 1)
+    build, int32, one = writer.builder, ir.IntType(32), writer.int64(1)
+    field = {name: build.load(build.gep(function.args[0], [int32(0), int32(i)])) for i, name in enumerate(FIELD_TYPES)}
+    build.store(FLOAT64(0.0), field["status"])
+    build.call(field["begin"], [field["parameters"], field["block"], one])
+    with writer.loop_range(field["n_segments"]) as i:
+        size, count, increments = (
+            build.load(build.gep(field[name], [i])) for name in ("sizes", "counts", "increments")
+        )
+        build.store(size, field["h"])
+        build.store(writer.int64(0), field["n_done"])
+        state = field["parameters"], field["block"], field["n_done"]
+        n_saves = build.call(
+            field["advance"], [*state, one, one, count, field["saved"], count, increments, field["newton"]]
+        )
+        has_failed = build.fcmp_unordered("!=", build.load(field["status"]), FLOAT64(0.0))
+        with build.if_then(build.or_(build.icmp_signed("<", n_saves, one), has_failed)):
+            build.ret(one)
+    build.ret(writer.int64(0))
+    return MachineCode(module)
 
 
 class CompiledEngine:
@@ -200,3 +292,92 @@ class CompiledTrajectory:
             < 1
         ):
             newton = self._loop.newton_address(True)
+
+
+class CompiledBatch:
+    """Trajectories in lanes with steps of given sizes, the counterpart of :class:`..array_engine.ArrayBatch`.
+
+    Parameters
+    ----------
+    step_loop : CompiledStepLoop
+    first_parameters : array, shape (p,)
+        Parameters of one trajectory: of its system and the method.
+    parameters : array, shape (p,) or (trajectories, p)
+    x : array, shape (trajectories, n)
+    """
+
+    def __init__(self, step_loop: CompiledStepLoop, first_parameters, parameters, x: np.ndarray):
+        self._loop, self._first_parameters, self._n_trajectories = step_loop, first_parameters, len(x)
+        self._blocks = step_loop.start_blocks(parameters, x)
+
+    def advance(self, h, n_saves: int, steps_per_save: int, noise=None) -> np.ndarray:
+        """Take ``n_saves * steps_per_save`` steps; return states, energies and entropies, shape (B, n_saves, n + 2)."""
+        sizes = np.resize(h, len(self._blocks) * self._loop.lanes) if np.ndim(h) else h
+        saved = self._loop.advance_blocks(self._first_parameters, self._blocks, sizes, n_saves, steps_per_save, noise)
+        return np.asarray(saved)[: self._n_trajectories]
+
+    def read(self, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """Return copies of fields of the trajectories by name, by default of all fields."""
+        fields = self._loop.read_fields(self._blocks, names)
+        return {name: values[: self._n_trajectories].copy("K") for name, values in fields.items()}
+
+
+class CompiledAdaptiveRuns:
+    """Adaptive runs of trajectories in lanes, the counterpart of :class:`..engine.ArrayAdaptiveRuns`.
+
+    Parameters
+    ----------
+    step_loop : CompiledStepLoop
+    first_parameters : array, shape (p,)
+        Parameters of one trajectory: of its system, the method and the step control.
+    parameters : array, shape (p,) or (trajectories, p)
+    x : array, shape (trajectories, n)
+    t, stop_time, span_length : float
+        See :func:`..adaptive_steps.initial_adaptive_state`.
+    """
+
+    def __init__(
+        self, step_loop: CompiledStepLoop, first_parameters, parameters, x: np.ndarray, t, stop_time, span_length
+    ):
+        self.step_loop, self.first_parameters, self.n_trajectories = step_loop, first_parameters, len(x)
+        initial_fields = {
+            name: np.full((len(x), 1), value)
+            for name, value in (("t", t), ("stop_time", stop_time), ("length", span_length))
+        }
+        self.blocks = step_loop.start_blocks(parameters, x, 0, **initial_fields)
+
+    def advance(self, max_attempts: int) -> None:
+        self.step_loop.advance_blocks(self.first_parameters, self.blocks, 0.0, 1, max_attempts)
+
+    def state(self) -> State:
+        return self.step_loop.state_from_block(self.blocks.copy())
+
+    def attempt_and_record(self, max_attempts: int) -> dict[str, np.ndarray]:
+        """Make up to ``max_attempts`` attempts of the only trajectory and return their records: see ATTEMPT_FIELDS."""
+        n_before, out = self.read("n_attempts")[0], np.empty((1, max_attempts, self.step_loop.n_saved_values))
+        try:
+            self.step_loop.advance_blocks(self.first_parameters, self.blocks, 0.0, max_attempts, 1, out=out)
+        except UnsupportedPrimitive:
+            if self.read("n_attempts")[0] == n_before:
+                raise
+        return self.step_loop.saved_fields_of_one(out[0, : int(self.read("n_attempts")[0] - n_before)])
+
+    def read(self, name: str, indices: np.ndarray | slice = slice(None)) -> np.ndarray:
+        if isinstance(indices, slice):
+            return self.step_loop.read_fields(self.blocks, (name,))[name][: self.n_trajectories][indices].copy()
+        values = self._lane_values(indices, name)
+        return values if name == "p" else values.reshape(len(indices), *self.step_loop.field_shape(name))
+
+    def write(self, name: str, indices: np.ndarray, values) -> None:
+        block, lane = np.divmod(indices, self.step_loop.lanes)
+        values = np.reshape(values, (len(indices), -1)) if np.ndim(values) else values
+        self.step_loop.block_rows(self.blocks, name)[block, :, lane] = values
+
+    def _lane_values(self, indices: np.ndarray, name: str | None = None) -> np.ndarray:
+        """Return a field of the chosen trajectories, or all their rows, shape (trajectories, rows)."""
+        block, lane = np.divmod(indices, self.step_loop.lanes)
+        return self.step_loop.block_rows(self.blocks, name)[block, :, lane]
+
+    def keep_only(self, indices: np.ndarray) -> None:
+        """Drop all trajectories except the chosen ones."""
+        self.blocks, self.n_trajectories = self.step_loop.blocks_from_rows(self._lane_values(indices)), len(indices)

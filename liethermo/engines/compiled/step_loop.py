@@ -35,10 +35,10 @@ from .loop_codegen import (
     BlockLayout,
     CompiledLoops,
     NamedProgram,
+    compile_newton_solver,
     compile_step_loop,
 )
 from .machine_code import MachineCode
-from .newton_codegen import compile_newton_solver
 from .parameters import ProgramStructure
 
 STATE_FIELDS = State._fields

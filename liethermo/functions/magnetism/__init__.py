@@ -1,6 +1,6 @@
 """Energies of spins, lattices, and the quantities that are measured in magnets."""
 
-from manifolds._names import public_dir
+from manifolds._arguments import public_dir
 
 from .bond_terms import biquadratic, exchange_tensor
 from .correlations import StructureFactor, dynamic_structure_factor, structure_factor, topological_charge

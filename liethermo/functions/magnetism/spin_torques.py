@@ -19,8 +19,8 @@ from manifolds.structures.spins import cross
 from ...errors import FunctionError, InputError
 from ...tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ...tracing.traced import trace_callables_and_result_shapes
-from ..arguments import required_argument_count
 from ..conditions import checked_numbers
+from ..time_span import required_argument_count
 from .lattices import Lattice
 
 

@@ -9,7 +9,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.learn.networks import learned_mask
+from liethermo.learn.parts import learned_mask
 from liethermo.runs.preparation import prepare_for_method
 
 from . import cases

@@ -13,8 +13,7 @@ import manifolds as mf
 from liethermo.engines import array_engine
 from liethermo.engines.compiled.engine import CompiledEngine
 from liethermo.engines.compiled.step_loop import CompiledStepLoop
-from liethermo.engines.growth_rate import arnoldi_hessenberg
-from liethermo.engines.step_control import step_size_after_acceptance, step_size_after_rejection
+from liethermo.engines.step_control import arnoldi_hessenberg, step_size_after_acceptance, step_size_after_rejection
 from liethermo.runs import adaptive_run
 from liethermo.tracing.scalarize import UnsupportedPrimitive
 from tests.systems import rigid_body

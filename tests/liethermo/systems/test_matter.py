@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import liethermo as lt
-from liethermo.dissipation.matter import Process, conserved_number_combinations
+from liethermo.dissipation.bodies import Process, conserved_number_combinations
 from liethermo.models.open_gases import porous_piston_state
 from liethermo.systems.invariants import recorded_invariants
 from tests.refusals import refusal_test

@@ -14,7 +14,7 @@ import liethermo as lt
 from liethermo.engines.sparse import colouring_and_lu
 from liethermo.functions.gradients import DISCRETE_GRADIENTS, stage_gradients
 from liethermo.integrators.tableaus import gauss_tableau
-from liethermo.models.heat_grid import grid_adjacency_matrix, heat_grid_solution
+from liethermo.models.thermo_particles import grid_adjacency_matrix, heat_grid_solution
 from tests.cases import tolerance
 from tests.refusals import refusal_test
 

@@ -12,7 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import manifolds as mf
-from manifolds.algebras import _null_space as linear
+from manifolds.algebras import _subspaces as linear
 from manifolds.algebras import polynomial_casimirs as module
 from manifolds.algebras.polynomial import Polynomial
 from tests.cases import ALGEBRAS
