@@ -19,9 +19,9 @@ def checked_size(value: int, minimum: int, name: str, label: str = "n") -> int:
     return int(value)
 
 
-def check_memory(n_numbers: float, label: str, advice: str, bytes_per_number: int = 8) -> None:
-    """Raise SizeError if an array of ``n_numbers`` numbers would take more than half of this machine's memory."""
-    n_bytes, memory = float(n_numbers) * bytes_per_number, memory_bytes()
+def check_memory(n_numbers: float, label: str, advice: str) -> None:
+    """Raise SizeError if ``n_numbers`` numbers of 8 bytes would take more than half of this machine's memory."""
+    n_bytes, memory = 8.0 * float(n_numbers), memory_bytes()
     if n_bytes > memory / 2:
         raise SizeError(
             f"{label} would take {n_bytes / 1e9:.3g} GB, and this machine has {memory / 1e9:.3g} GB of memory; {advice}"

@@ -449,6 +449,3 @@ PER_MEMBER_FIELDS = tuple(
     "largest_energy end_time rejected".split()
 )
 """Fields with one value for each trajectory."""
-
-REQUIRED_FIELDS = ("energy", "x0", *PER_MEMBER_FIELDS)
-"""Fields that every ensemble has."""

@@ -34,11 +34,14 @@ MAX_POINTS = 400
 MAX_CURVES = 8
 """Largest number of curves, which is the number of colours."""
 
+SKETCH_SIZE = (280, 110)
+"""Width and height of a sketch in pixels."""
+
 CURVE_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#999999", "#F0E442")
 """Colours of the curves, which colour-blind readers can tell apart [Okabe & Ito 2008]."""
 
 
-def svg_sketch(t: np.ndarray, series: np.ndarray, label: str, width: int = 280, height: int = 110) -> str:
+def svg_sketch(t: np.ndarray, series: np.ndarray, label: str) -> str:
     """Draw curves over time in one frame, with a common scale.
 
     Parameters
@@ -54,6 +57,7 @@ def svg_sketch(t: np.ndarray, series: np.ndarray, label: str, width: int = 280, 
     str
         An ``<svg>`` element.
     """
+    width, height = SKETCH_SIZE
     indices = np.unique(np.linspace(0, len(t) - 1, min(len(t), MAX_POINTS)).round().astype(int))
     t, series = t[indices], series[indices, :MAX_CURVES]
     finite_values = series[np.isfinite(series)]

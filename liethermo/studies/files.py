@@ -119,13 +119,17 @@ def lock_store(root: Path) -> Iterator[Callable[[int], None]]:
         yield record_run
 
 
-def _try_lock(file, n_attempts: int = 5) -> bool:
+LOCK_ATTEMPTS = 5
+"""Number of attempts to lock a store."""
+
+
+def _try_lock(file) -> bool:
     """Try to lock a file, and return True if that succeeded.
 
     A process that asks whether a run is active (:func:`active_run_record`) holds the lock for a moment, hence several
     attempts.
     """
-    for _ in range(n_attempts):
+    for _ in range(LOCK_ATTEMPTS):
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             return True

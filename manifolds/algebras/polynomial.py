@@ -306,9 +306,13 @@ def fill_in_parameters(template: str, parameters: dict[str, float]) -> str:
     return template.format(**numbers)
 
 
-def is_integer_ratio(value: float, max_denominator: int = 1000) -> tuple[int, int] | None:
+MAX_EXPONENT_DENOMINATOR = 1000
+"""Largest denominator of an exponent that is written as a ratio of integers."""
+
+
+def is_integer_ratio(value: float) -> tuple[int, int] | None:
     """Return (n, m) with ``value = n/m`` to the last digit and m small, or None."""
-    for denominator in range(1, max_denominator + 1):
+    for denominator in range(1, MAX_EXPONENT_DENOMINATOR + 1):
         numerator = round(value * denominator)
         if math.isclose(numerator / denominator, value, rel_tol=2e-16, abs_tol=0.0):
             return numerator, denominator

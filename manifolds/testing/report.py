@@ -51,14 +51,14 @@ class Suite:
         value = float(np.abs(np.asarray(residual)).max(initial=0.0)) / max(float(np.max(size)), 1e-300)
         self.rows.append(TableRow(name, value, allowed, bool(value <= allowed), note))
 
-    def check_equal(self, name: str, a, b, allowed: float = 1e-12, note: str = "") -> None:
+    def check_equal(self, name: str, a, b, allowed: float = 1e-12) -> None:
         """Check that two arrays are equal, relative to the largest of their entries and 1."""
         a, b = np.asarray(a), np.asarray(b)
         if a.shape != b.shape:
             self.check_true(name, False, f"shapes {a.shape} and {b.shape}")
             return
         scale = max(1.0, *(float(np.abs(v).max(initial=0.0)) for v in (a, b)))
-        self.check_small(name, a - b, scale, allowed, note)
+        self.check_small(name, a - b, scale, allowed)
 
     def check_true(self, name: str, holds, note: str = "") -> None:
         """Check that a property holds."""

@@ -174,13 +174,17 @@ def _conserved_and_changing(solution: Solution, system: System | None) -> tuple[
     return (quantities[0], quantities[1]) if solution.laws.energy == "conserved" else (quantities[1], quantities[0])
 
 
-def _vectorize_in_blocks(function: Callable, block: int = 8192) -> PointFunction:
+VALUES_PER_BLOCK = 8192
+"""Number of points at which a function is evaluated by one call of its program."""
+
+
+def _vectorize_in_blocks(function: Callable) -> PointFunction:
     """Vectorize a function over arrays of points of any shape, in blocks of one size so that it is compiled once."""
     compiled_function = jax.jit(lambda x: function(x))
 
     def evaluate(points: np.ndarray) -> np.ndarray:
         flat = points.reshape(-1, 3)
-        padded = np.concatenate([flat, np.zeros((-len(flat) % block, 3))]).reshape(-1, block, 3)
+        padded = np.concatenate([flat, np.zeros((-len(flat) % VALUES_PER_BLOCK, 3))]).reshape(-1, VALUES_PER_BLOCK, 3)
         return np.concatenate([compiled_function(x) for x in padded])[: len(flat)].reshape(points.shape[:-1])
 
     return evaluate
@@ -344,9 +348,9 @@ def sphere_grid(rows: int, columns: int) -> np.ndarray:
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
 
 
-def _great_circle(normal: np.ndarray, points: int = 360) -> np.ndarray:
-    """Return unit vectors orthogonal to ``normal``, shape (points + 1, 3)."""
-    phi = np.linspace(0, 2 * np.pi, points + 1)[:, None]
+def _great_circle(normal: np.ndarray) -> np.ndarray:
+    """Return unit vectors orthogonal to ``normal``, one a degree, shape (361, 3)."""
+    phi = np.linspace(0, 2 * np.pi, 361)[:, None]
     _, _, (_, a, b) = np.linalg.svd(normal[None])
     return np.cos(phi) * a + np.sin(phi) * b
 

@@ -14,8 +14,6 @@ from liethermo.runs.preparation import prepare_for_method
 
 from . import cases
 
-LAWS = ("Pi skew", "Pi grad S = 0", "K symmetric", "K grad H = 0", "K >= 0", "energy law", "entropy law")
-
 
 def _failed_axioms(system):
     return {row.axiom for row in system.check().rows if row.passed is False}

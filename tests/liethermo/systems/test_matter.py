@@ -24,9 +24,9 @@ def start():
     return porous_piston_state((1.5, 1.2), (0.8, 0.7), 0.9)
 
 
-def gas_state(T=0.8, jacket=1.5):
+def gas_state():
     N = jnp.array([1.0, 0.7, 0.1])
-    return np.array([float(GAS.entropy_at(T, N, 1.0)), *N, 20.0 * np.log(jacket)])
+    return np.array([float(GAS.entropy_at(0.8, N, 1.0)), *N, 20.0 * np.log(1.5)])
 
 
 def piston_by_hand(t, y):

@@ -10,10 +10,10 @@ import manifolds as mf
 SPACES = [mf.Sphere(2), mf.SpecialOrthogonal(3), mf.SPD(3), mf.Hyperbolic(2)]
 
 
-def cloud(space, seed, size=12, scale=0.4):
+def cloud(space, seed, size=12):
     rng = np.random.default_rng(seed)
     centre = space.random(seed)
-    return space.exp(centre, space.from_coordinates(centre, scale * rng.standard_normal((size, space.dim))))
+    return space.exp(centre, space.from_coordinates(centre, 0.4 * rng.standard_normal((size, space.dim))))
 
 
 def twin(space):
