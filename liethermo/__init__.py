@@ -46,11 +46,10 @@ from .errors import (
 )
 from .functions import magnetism
 from .functions.density import VonNeumann
-from .functions.each import Each
 from .functions.energy import Energy, Function, Quadratic, TimeDependent
 from .functions.gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
-from .functions.mechanics import Kinetic, Potential
-from .functions.piecewise import PiecewiseConstant
+from .functions.mechanics import Each, Kinetic, Potential
+from .functions.time_span import PiecewiseConstant
 from .integrators import (
     DiscreteHerglotz,
     FiniteDifference,
@@ -69,7 +68,7 @@ from .integrators import (
 from .models import torques
 from .results.audit import Audit
 from .results.ensemble import Ensemble
-from .results.load import load
+from .results.files import load
 from .results.solution import Solution
 from .results.status import Stats, Status
 from .runs.adaptive import Adaptive

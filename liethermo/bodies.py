@@ -14,7 +14,7 @@ from .models.inertia import PrincipalAxes, principal_axes
 from .models.jointed_bodies import JointedBodies
 from .models.joints import Hinge, Slider, Universal
 from .models.tree import Tree
-from .results.attitude_files import AttitudeHistory, read_csv, write_csv
+from .results.files import AttitudeHistory, read_csv, write_csv
 from .results.orientation import (
     angular_velocity,
     euler_angles,

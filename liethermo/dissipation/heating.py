@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..errors import InputError
+from ..functions.bath_energy import temperature_derivatives_by_entropy
 from ..functions.edges import graph_edges
 from ..functions.energy import Energy
 from ..functions.frames import sqrt_or_zero
 from ..functions.indices import Indices
-from ..functions.with_baths import temperature_derivatives_by_entropy
 from .base import Dissipation, DissipationSum, LiftedDissipation, LiftedGeometry
 from .bodies import HeatConduction
 from .geometry import Geometry

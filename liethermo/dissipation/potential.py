@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from manifolds._pytree_module import Module, forward_to
-from manifolds.matrices.stumpff import hyperbolic_stumpff
+from manifolds.matrices.exponential import hyperbolic_stumpff
 
 from ..errors import FunctionError, InputError
 from ..functions.conditions import checked_numbers

@@ -3,7 +3,7 @@
 An adaptive run carries an :class:`.AdaptiveState`. One attempt takes a step, estimates its error, and chooses the size
 of the next step. The run pauses when the host has to act: at a stop time, if the growth rate must be computed, and at a
 possible event. A step in which the event function changes its sign is repeated with shorter sizes, until it ends at
-the sign change: at a zero, which is an event, or at a jump (:meth:`.engine.PauseHandler.decide_sign_changes`).
+the sign change: at a zero, which is an event, or at a jump (:meth:`.sparse_engine.PauseHandler.decide_sign_changes`).
 """
 
 from __future__ import annotations

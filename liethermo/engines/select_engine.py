@@ -18,7 +18,7 @@ from ..tracing.scalarize import UnsupportedPrimitive
 from .adaptive_runs import AdaptiveRuns, ArrayAdaptiveRuns, resume_on_array_engine, start_adaptive_run
 from .array_engine import ArrayEngine, EngineTrajectory
 from .compiled.engine import CompiledAdaptiveRuns, CompiledEngine, CompiledTrajectory
-from .sparse.engine import SparseEngine
+from .sparse_engine import SparseEngine
 from .step import SavedStates, State
 from .step_control import StepControl
 

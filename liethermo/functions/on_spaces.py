@@ -24,10 +24,10 @@ from manifolds.structures.spins import (
     sum_of_dots,
 )
 
+from .bath_energy import BodyBathsEnergy
 from .energy import Energy, Function, Multiple, Negative, Pullback, Quadratic, Sum, TimeDependent
 from .indices import ComponentMap
 from .magnetism.spin_energy import SpinEnergy, flatten_covectors, lattice_spins
-from .with_baths import BodyBathsEnergy
 
 
 class PointEnergy(Energy):

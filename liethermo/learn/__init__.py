@@ -5,8 +5,7 @@ from manifolds._arguments import public_dir
 from .files import load, save
 from .fitting import fit
 from .identifiability import Determined, Fits, determined, several
-from .model import Metriplectic
-from .parts import Energy, Entropy, Friction, Learned, Poisson
+from .parts import Energy, Entropy, Friction, Learned, Metriplectic, Poisson
 from .records import Records, Trajectory, read_data
 from .training import ConfidenceInterval, FitWarning, Training
 

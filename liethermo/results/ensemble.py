@@ -401,7 +401,7 @@ class Ensemble(AuditableResult):
 
     @classmethod
     def from_file(cls, series: dict[str, np.ndarray], attributes: dict[str, Any]) -> Ensemble:
-        """Build an ensemble from the arrays and attributes of a file, as :func:`.files.read_dataset` returns them.
+        """Build an ensemble from the arrays and attributes of a file, as :func:`.netcdf.read_dataset` returns them.
 
         KeyError, TypeError or ValueError if a part is missing or does not fit.
         """

@@ -15,7 +15,6 @@ from jax.flatten_util import ravel_pytree
 from manifolds._arrays import is_traced
 from manifolds._precision import with_library_settings
 
-from ..engines.implicit_differentiation import implicit_solution
 from ..engines.stage_solver import (
     StageEquations,
     StageSolution,
@@ -37,7 +36,7 @@ from ..systems import System
 from ..systems.clock import system_of_step
 from ..tracing.programs import jit_cached, jit_unoptimised
 from .adaptive import Adaptive
-from .flow_derivatives import state_derivatives
+from .flow_derivatives import implicit_solution, state_derivatives
 from .named_parameters import replace_parameters
 from .preparation import (
     checked_initial_state,

@@ -13,7 +13,7 @@ from ..errors import FileError
 from ..results.audit import Audit, AuditRow, Tolerances, check_laws
 from ..results.netcdf import dataclass_from_json
 from ..results.status import Laws
-from . import files
+from . import store_metadata
 from .progress import StudyStatus, seconds_left
 from .solve import EMPTY_POINT_STATUS, LAW_BROKEN, MEASURE_FAILED, STATUSES, SUCCESS_CODES, LawSummary
 from .store import StudyStore
@@ -56,7 +56,7 @@ def load_status(path: Any) -> StudyStatus:
 
 def store_status(store: StudyStore) -> StudyStatus:
     """Return the status of an open store."""
-    counts, running = store.status_counts(), files.active_run_record(store.root)
+    counts, running = store.status_counts(), store_metadata.active_run_record(store.root)
     n_done = store.n_points - counts.get("missing", 0)
     time_left = None if running is None or "started" not in running else seconds_left(store.n_points, n_done, running)
     return StudyStatus(store.n_points, n_done, counts, running, time_left)

@@ -10,12 +10,12 @@ from .embedded import ChartSystem, EmbeddedSystem, embed_in_arrays
 from .equilibria import Equilibria, Equilibrium, equilibria, steady_state
 from .euler_poincare import EulerPoincareClosedSystem, EulerPoincareSystem, Legendre
 from .evolution import ContactSystem, EvolutionSystem
+from .hamiltonian import RotatingFrame
 from .herglotz import Herglotz, ThermodynamicHerglotz
 from .lie_poisson import LiePoissonSystem
 from .linearisation import Linearisation, Stability, linearise
 from .metriplectic import MetriplecticSystem
 from .quantum import QuantumSystem
-from .rotating_frame import RotatingFrame
 from .simple_closed import ChetaevSystem, SimpleClosedSystem
 from .spins import SpinSystem
 

@@ -16,7 +16,7 @@ from ..errors import InputError
 from ..integrators import MetriplecticMidpoint
 from ..integrators.base import has_error_estimate
 from ..interop.scipy import solve_ivp
-from ..results.load import load
+from ..results.files import load
 from ..results.solution import Solution
 from ..runs.adaptive import Adaptive
 from ..runs.ensemble import Ensemble, ensemble

@@ -20,7 +20,6 @@ from .._arguments import checked_names
 from .._arrays import is_traced, real_array, real_components, square_matrices
 from ..errors import LieAlgebraError, ParameterError
 from ._rational import RationalArray, rational_array
-from .actions import Action, AdMatrixAction, Operator, terms_to_unroll, unrolled_bracket
 from .axioms import (
     STRUCTURE_TOLERANCE,
     balance_constants,
@@ -33,6 +32,7 @@ from .bracket_table import algebra_html, constants_and_names
 from .casimirs import DEFAULT_MAX_DEGREE, casimirs, casimirs_up_to, check_invariant, leading_casimirs
 from .killing import cartan_involution_of, killing_form_of, row_space_basis
 from .polynomial_casimirs import casimir_count
+from .structure import Action, AdMatrixAction, Operator, terms_to_unroll, unrolled_bracket
 from .structure_methods import CasimirInBasis, StructureMethods, constants_in_basis
 
 

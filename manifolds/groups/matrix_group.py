@@ -23,13 +23,11 @@ from .._arrays import first_nonfinite_index, first_true_index, format_index, is_
 from .._class_members import ListedType
 from ..algebras.lie_algebra import LieAlgebra
 from ..errors import ComponentError, DomainError, LieAlgebraError
-from ..matrices.exponential import CAYLEY_CONDITION_LIMIT, cayley_of
+from ..matrices.exponential import CAYLEY_CONDITION_LIMIT, HALF_TURN_MARGIN, cayley_of
 from ..matrices.linear import inverse, max_abs_entry, solve
-from ..matrices.stumpff import HALF_TURN_MARGIN
 from . import closed_forms as closed
 from . import maps
-from .defining_equations import fields_from_equations
-from .maps import product_fields
+from .maps import fields_from_equations, product_fields
 
 MEMBERSHIP_TOLERANCE = 1e-8
 """Largest distance of a matrix from the group, relative to its size, at which its logarithm is taken."""

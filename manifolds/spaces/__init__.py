@@ -5,10 +5,9 @@ from .constant_curvature import Euclidean, Hyperbolic, Sphere
 from .groups import GroupSpace, SpecialEuclidean, SpecialOrthogonal, SpecialUnitary
 from .homogeneous import Flag, Homogeneous
 from .level_set import LevelSet
-from .product import Oblique, Power, Product
+from .product import Oblique, Power, Product, TangentBundle
 from .spd import SPD, Correlation
 from .stiefel import Grassmann, Stiefel
-from .tangent_bundle import TangentBundle
 
 __all__ = [
     "SPD",

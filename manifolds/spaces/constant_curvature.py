@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._arguments import checked_size
+from ..matrices.exponential import angle_over_sine, arcsinh_over_sinh, hyperbolic_stumpff, stumpff
 from ..matrices.linear import orthonormal_complement, skew_matrix
-from ..matrices.stumpff import angle_over_sine, arcsinh_over_sinh, hyperbolic_stumpff, stumpff
 from .base import CUT_MARGIN, Space, register
 from .maps import inner_by_coordinates, safe_sqrt, tangential_part_by_projection
 

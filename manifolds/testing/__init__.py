@@ -5,8 +5,7 @@ Each ``check_*`` runs the checks of every registered object of that kind. It ret
 """
 
 from .._arguments import public_dir
-from .report import PropertyError, Report, Suite
-from .suites import check_algebra, check_group, check_space
+from .suites import PropertyError, Report, Suite, check_algebra, check_group, check_space
 
 __all__ = ["PropertyError", "Report", "Suite", "check_algebra", "check_group", "check_space"]
 __dir__ = public_dir(__all__)

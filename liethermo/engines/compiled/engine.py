@@ -323,7 +323,7 @@ class CompiledBatch:
 
 
 class CompiledAdaptiveRuns:
-    """Adaptive runs of trajectories in lanes, the counterpart of :class:`..engine.ArrayAdaptiveRuns`.
+    """Adaptive runs of trajectories in lanes, the counterpart of :class:`..adaptive_runs.ArrayAdaptiveRuns`.
 
     Parameters
     ----------

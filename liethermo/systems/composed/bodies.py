@@ -18,8 +18,8 @@ from ...dissipation.checks import checked_semidefinite
 from ...errors import InputError
 from ...functions.checks import checked_energy, traced_function_and_shape, with_polynomial_degrees
 from ...functions.conditions import checked_numbers, require_condition
-from ...functions.each import Each
 from ...functions.energy import Energy, Quadratic, make_energy
+from ...functions.mechanics import Each
 
 
 class Subsystem(Module):

@@ -8,7 +8,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.dissipation.noise import factor_divergences, terms_with_factors
-from liethermo.models.gas_piston import gas_piston_state
+from liethermo.models.gases import gas_piston_state
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 from tests.cases import DISSIPATIONS, build, state_of
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
-from liethermo.models.gas_piston import CASES, cylinder_rest, mass_spring_gas_solution
+from liethermo.models.gases import CASES, cylinder_rest, mass_spring_gas_solution
 from liethermo.tracing.interpret import evaluate_at_points
 from tests.refusals import refusal_test
 

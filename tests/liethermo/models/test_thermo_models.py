@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import liethermo as lt
-from liethermo.models.gas_piston import GAS_CONSTANT, IdealGas, gas_piston_equilibrium, gas_piston_state
-from liethermo.models.oscillator import damped_oscillator_solution
+from liethermo.models.gases import GAS_CONSTANT, IdealGas, gas_piston_equilibrium, gas_piston_state
+from liethermo.models.springs import damped_oscillator_solution
 from liethermo.models.thermo_particles import thermo_particles_solution
 from tests.cases import tolerance
 from tests.refusals import refusal_test

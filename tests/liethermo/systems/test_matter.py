@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 from liethermo.dissipation.bodies import Process, conserved_number_combinations
-from liethermo.models.open_gases import porous_piston_state
+from liethermo.models.gases import porous_piston_state
 from liethermo.systems.invariants import recorded_invariants
 from tests.refusals import refusal_test
 

@@ -7,7 +7,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.integrators import fluctuating
-from liethermo.models.gas_piston import GAS_CONSTANT, gas_piston_state
+from liethermo.models.gases import GAS_CONSTANT, gas_piston_state
 from liethermo.testing import PropertyError, check_equilibrium
 from liethermo.testing.equilibrium import sample_exact_measure
 from tests.additions.group import LINE

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import manifolds as mf
 from manifolds.groups import maps
 from manifolds.matrices import exponential, linear
-from manifolds.matrices.stumpff import stumpff
+from manifolds.matrices.exponential import stumpff
 
 TOLERANCES = {
     # name: (bound, what was measured and why)

@@ -13,9 +13,8 @@ import pytest
 import scipy.linalg
 
 import manifolds as mf
-from manifolds.matrices.divided_differences import GenericFunction, scalar_function
 from manifolds.matrices.exponential import expm
-from manifolds.matrices.spectral import log_mean
+from manifolds.matrices.spectral import GenericFunction, log_mean, scalar_function
 from manifolds.matrices.symmetric import eigh, orthogonal_images, polar
 
 NAMES = ["exp", "log", "log1p", "sqrt", "reciprocal"]

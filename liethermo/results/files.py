@@ -1,4 +1,4 @@
-"""Histories of attitudes and angular velocities as CSV files, with the units in the names of the columns."""
+"""Reading of results, and histories of attitudes as CSV files, with the units in the names of the columns."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from ..errors import FileError, InputError
 from ..systems.rotations import rotation_matrices
 from ..units import parse_unit, split_label
 from .audit_evidence import AuditableResult
+from .ensemble import Ensemble
+from .netcdf import ENSEMBLE_FORMAT, read_dataset
 from .orientation import angular_velocity, quaternions
+from .solution import Solution
 
 QUATERNION_COLUMNS = ("q_x", "q_y", "q_z", "q_w")
 """Names of the columns of quaternions, by which their order in a file does not matter."""
@@ -170,3 +173,38 @@ def _factor_to_si(path: Path, quantity: str, name: str, si_unit: str) -> float:
     if unit.dimension != parse_unit(si_unit).dimension:
         raise FileError(f"{path} has {quantity} in {name!r}, a unit of another kind. Convert the column to {si_unit}")
     return unit.factor
+
+
+def load(path: str | os.PathLike) -> Solution | Ensemble:
+    """Read a file written by :meth:`Solution.save` or :meth:`Ensemble.save`.
+
+    Parameters
+    ----------
+    path : str or path
+        The NetCDF file.
+
+    Raises
+    ------
+    FileError
+        If the file is missing, cut short, damaged, or not a result of this library.
+
+    Warns
+    -----
+    UserWarning
+        If an earlier version wrote the file, without a checksum: damage may show in nothing.
+
+    Examples
+    --------
+    >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
+    >>> solution = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 5.0), 0.1)
+    >>> path = solution.save("run.nc")
+    >>> bool((lt.load("run.nc").x == solution.x).all())
+    True
+    """
+    series, attributes = read_dataset(path)
+    try:
+        if attributes["format"] == ENSEMBLE_FORMAT:
+            return Ensemble.from_file(series, attributes)
+        return Solution.from_file(series, attributes)
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        raise FileError(f"{path} lacks a part of a liethermo result: {error}") from error
