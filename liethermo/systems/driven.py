@@ -16,8 +16,8 @@ from manifolds.structures.poisson import PoissonBySharp, ProductPoisson
 from ..dissipation.base import SkewFriction
 from ..errors import InputError
 from ..functions.checks import with_polynomial_degrees
-from ..functions.coordinates import ComponentMap
 from ..functions.energy import ChartEnergy, Energy, Linear, Pullback, Quadratic, StateTimeEnergy, Sum
+from ..functions.indices import ComponentMap
 from ..functions.time_span import TimeSpan
 from .base import System
 from .clock import WORK_NAME, Clock

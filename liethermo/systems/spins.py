@@ -18,17 +18,22 @@ from manifolds.structures.poisson import ProductPoisson
 from manifolds.structures.spins import add_vectors, cross, cross_vectors, dot_vectors, scale_vectors, split_vectors
 
 from ..dissipation.base import Dissipation, LawName
-from ..dissipation.bath_conduction import BathConduction
-from ..dissipation.heating import Heating
+from ..dissipation.heating import BathConduction, Heating
 from ..dissipation.landau_lifshitz import LandauLifshitz
 from ..errors import InputError
 from ..functions.checks import traced_function_and_shape
 from ..functions.energy import Energy
 from ..functions.magnetism.spin_energy import lattice_shape
 from ..functions.magnetism.spin_torques import check_spin_torque
-from ..functions.on_spaces import flatten_site_functions
-from ..functions.planes import energy_in_component_order, interaction_range, to_component_order, to_site_order
-from ..functions.spheres import HalfSumOfSquares, Spheres
+from ..functions.on_spaces import (
+    HalfSumOfSquares,
+    Spheres,
+    energy_in_component_order,
+    flatten_site_functions,
+    interaction_range,
+    to_component_order,
+    to_site_order,
+)
 from .base import System
 from .baths import HeatBaths, poisson_with_baths
 from .torque import TorqueSystem, torque_name

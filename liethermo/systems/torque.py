@@ -15,8 +15,7 @@ import manifolds as mf
 from manifolds._pytree_module import replace_fields
 
 from ..errors import FunctionError, InputError
-from ..functions.arguments import required_argument_count
-from ..functions.piecewise import is_spline
+from ..functions.time_span import is_spline, required_argument_count
 from ..tracing.interpret import MAX_UNROLLED_DIM, vanishing_entry_indices
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import TracedFunction, trace_callables_and_result_shapes

@@ -7,7 +7,7 @@ import scipy
 
 from .._arrays import real_components
 from ..errors import ComponentError, LieAlgebraError, ShapeError
-from ._basis_scaling import STRUCTURE_TOLERANCE
+from .axioms import STRUCTURE_TOLERANCE
 
 
 def killing_form_of(constants: np.ndarray) -> np.ndarray:

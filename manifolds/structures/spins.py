@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._arguments import checked_size
 from .._arrays import real_array, stack_columns
-from .._sizes import checked_size
 from ..errors import ParameterError
 from .poisson import PoissonBySharp
 
