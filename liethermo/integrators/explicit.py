@@ -176,7 +176,7 @@ class ExplicitMethod(TransportingMethod):
         """
         orbit_dim, casimirs = system.orbit_levels
         # With a torque, the impulse is projected onto the orbit instead.
-        casimirs_are_held = system.has_impulse or casimirs <= set(self.held)
+        casimirs_are_held = system.torque_laws.has_impulse or casimirs <= set(self.held)
         return system.has_all_casimirs and casimirs_are_held and orbit_dim - len(casimirs) <= 2
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:

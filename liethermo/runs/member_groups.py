@@ -197,8 +197,9 @@ class _MemberFunctions:
         count, member = len(self.casimirs) + len(self.member.preserved), self.member
         verdicts = self._judge_functions(_casimir_and_preserved_rates, count, self.casimirs, use_nearby_states=True)
         # a torque may be zero at the test times only, so no function on which it acts counts as conserved
-        has_torque = [member.torque_name and name not in member.torque_invariant_casimirs for name in self.casimirs]
-        has_torque += [bool(member.torque_name)] * len(member.preserved)
+        torque = member.torque_laws
+        has_torque = [name in torque.changed_casimirs for name in self.casimirs]
+        has_torque += [torque.name != ""] * len(member.preserved)
         return np.where(np.array(has_torque, dtype=bool), VERDICT_NOT_CONSERVED, verdicts)
 
     def verdicts_of_requested_functions(self) -> np.ndarray:

@@ -130,9 +130,9 @@ def prepare_system_and_method(
     if not isinstance(method, OneStepMethod):
         if noise is not None:
             raise InputError(f"noise= works only with lt.MetriplecticMidpoint, got {method}")
-        if system.needs_attitude:
+        if system.torque_laws.needs_attitude:
             raise InputError(
-                f"the torque {system.torque_name} depends on the attitude, which {method} cannot integrate. Use a "
+                f"the torque {system.torque_laws.name} depends on the attitude, which {method} cannot integrate. Use a "
                 "method of the library, such as lt.MetriplecticGauss()"
             )
         return make_autonomous(system, unit=1.0), method  # its errors are measured component by component
@@ -150,7 +150,7 @@ def prepare_for_method(
         pullback_method(method, autonomous_system).on(autonomous_system, tolerance), autonomous_system.dim
     )
     reconstruction = system.reconstruction if isinstance(system, LiePoissonSystem) else None
-    if reconstruction is None or not (attitude or system.needs_attitude):
+    if reconstruction is None or not (attitude or system.torque_laws.needs_attitude):
         return autonomous_system, method
     assert isinstance(autonomous_system, LiePoissonSystem | DrivenSystem)
     kind = "exp" if method.explicit else reconstruction

@@ -162,7 +162,7 @@ def run_provenance(
         "group": None if group is None else group.name,
         "inertia": None if inertia is None else inertia.tolist(),
         "dissipation": None if system.dissipation is None else type(system.dissipation).__name__,
-        **({"torque": system.torque_name} if system.torque_name else {}),
+        **({"torque": system.torque_laws.name} if system.torque_laws.name else {}),
         **({"joints": {name: [start, end] for name, start, end in system.joint_ranges}} if system.joint_ranges else {}),
         **entries,
     }

@@ -66,7 +66,7 @@ class System(SystemInterface):
             "entropy": None if self.baths is not None and isinstance(body.entropy, BathEntropy) else body.entropy,
             "dissipation": self.dissipation,
             "baths": self.baths,
-            "torque": self.torque_name,
+            "torque": self.torque_laws.name,
         }
         name = f"{self.dim} components" if state_space is None else state_space.name
         return f"{type(self).__name__}({name}, {arguments_form(parts)})"

@@ -74,14 +74,14 @@ class DrivenSystem(LiftedSystem):
         energy = Sum((*map(self._extend_term, body.energy.terms), _NegativeWork(unit)))
         self.energy = energy if self.space is not None else with_polynomial_degrees(energy, self.dim)
         self._lift_laws()
-        if body.torque_name:
+        if body.torque_laws.name:
             has_law = body.entropy_law is not None or body.entropy is None
-            torque = _TorqueForce(law=body.torque_entropy_law if has_law else None)
+            torque = _TorqueForce(law=body.torque_laws.entropy_law if has_law else None)
             self.dissipation = torque if self.dissipation is None else self.dissipation + torque
 
     @property
     def kind(self) -> str:
-        return f"{self.body.kind} {'with a torque' if self.body.torque_name else 'whose energy depends on time'}"
+        return f"{self.body.kind} {'with a torque' if self.body.torque_laws.name else 'whose energy depends on time'}"
 
     # -- the state --------------------------------------------------------------------------------------------------
 
@@ -138,12 +138,11 @@ class DrivenSystem(LiftedSystem):
         return self._body_at_time(self.time(x))
 
     body_dim = forward_to("body")
-    needs_attitude = forward_to("body")
 
     def field(self, x, dH, dS, dL=()):
         motion = self.inner_at(x).drop_torque().field(*self.inner_arguments(x, dH, dS, dL))
         motion = jnp.concatenate([motion, _clock_velocity(dH, self.unit)])
-        return motion + self.torque_velocity(x, dH) if self.torque_name else motion
+        return motion + self.torque_velocity(x, dH) if self.torque_laws.name else motion
 
     def external_torque(self, x):
         return self.inner_at(x).external_torque(x[:-2]) if self.torque is None else self.torque
@@ -156,9 +155,7 @@ class DrivenSystem(LiftedSystem):
 
     def bind_attitude(self, attitude) -> DrivenSystem:
         """Return the system with its torque evaluated at an attitude, shape (m, m)."""
-        if not self.needs_attitude:
-            return self
-        return replace_fields(self, attitude=attitude)
+        return replace_fields(self, attitude=attitude) if self.torque_laws.needs_attitude else self
 
     def with_torque(self, torque) -> DrivenSystem:
         """Return the system with a fixed torque, shape (body.dim,)."""
@@ -228,7 +225,7 @@ class _TorqueForce(SkewFriction):
     """The torque on a body and the work that it does."""
 
     is_noiseless = True
-    preserves_casimirs = True  # of :attr:`System.torque_invariant_casimirs`; no other Casimir is claimed
+    preserves_casimirs = True  # but those that :attr:`System.torque_laws` lists as changed
 
     def force(self, system, x, dH, dS, dL):
         return system.torque_velocity(x, dH)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Self
 
 import equinox as eqx
@@ -50,6 +51,35 @@ class EngineHints(NamedTuple):
     can_unroll: bool = True
     has_matrix_functions: bool = False
     is_smooth: bool = True
+
+
+@dataclass(frozen=True)
+class TorqueLaws:
+    """Name of the torque from outside that acts on a system, and its effects; by default no torque acts.
+
+    Attributes
+    ----------
+    name : str
+        Name of the torque; "" if none acts.
+    has_impulse : bool
+        Whether the torque may change momenta that the group acts on, and not only those of internal parts.
+    needs_attitude : bool
+        Whether the torque depends on the attitude.
+    changed_casimirs : frozenset of str
+        Names of the Casimirs that the torque may change.
+    entropy_law : {"conserved", "nondecreasing"}
+        Law of the entropy under the torque alone: "nondecreasing" if it heats.
+    """
+
+    name: str = ""
+    has_impulse: bool = False
+    needs_attitude: bool = False
+    changed_casimirs: frozenset[str] = frozenset()
+    entropy_law: LawName = "conserved"
+
+
+TORQUE_FREE_LAWS = TorqueLaws()
+"""Laws of a system on which no torque acts."""
 
 
 class SystemInterface(Geometry):
@@ -199,24 +229,9 @@ class SystemInterface(Geometry):
         return eqx.tree_at(lambda system: system.energy, self, self.energy.at_time(t)) if self.is_driven else self
 
     @property
-    def torque_name(self) -> str:
-        """Name of the external torque; "" if none acts."""
-        return ""
-
-    @property
-    def has_impulse(self) -> bool:
-        """True if a torque may change momenta that the group acts on, and not only those of internal parts."""
-        return bool(self.torque_name)
-
-    @property
-    def torque_invariant_casimirs(self) -> frozenset[str]:
-        """Names of the Casimirs that the torque leaves constant."""
-        return frozenset() if self.torque_name else frozenset(self.casimirs())
-
-    @property
-    def needs_attitude(self) -> bool:
-        """True if the torque depends on the attitude."""
-        return False
+    def torque_laws(self) -> TorqueLaws:
+        """Name of the torque from outside, and what it does to the momenta, the Casimirs and the entropy."""
+        return TORQUE_FREE_LAWS
 
     def external_torque(self, x) -> jax.Array | None:
         """Return the external torque at a state, shape (n,), at a fixed time and attitude; None if none acts."""
@@ -228,11 +243,6 @@ class SystemInterface(Geometry):
         It is :meth:`external_torque` for torques, which do not depend on the gradient.
         """
         return self.external_torque(x)
-
-    @property
-    def torque_entropy_law(self) -> LawName:
-        """Law of the entropy under what acts from outside alone: "conserved", or "nondecreasing" if it heats."""
-        return "conserved"
 
     def drop_torque(self) -> Self:
         """Return the system without its external torque."""

@@ -85,9 +85,7 @@ class LiftedSystem(System):
     def hints(self) -> EngineHints:
         return self.inner.hints._replace(is_smooth=super().hints.is_smooth)
 
-    torque_name = forward_to("inner")
-    has_impulse = forward_to("inner")
-    torque_invariant_casimirs = forward_to("inner")
+    torque_laws = forward_to("inner")
     has_all_casimirs = forward_to("inner")
     orbit_levels = forward_to("inner")
     joint_ranges = forward_to("inner")

@@ -17,7 +17,7 @@ from manifolds._pytree_module import replace_fields
 from manifolds.structures.poisson import ProductPoisson
 from manifolds.structures.spins import add_vectors, cross, cross_vectors, dot_vectors, scale_vectors, split_vectors
 
-from ..dissipation.base import Dissipation, LawName
+from ..dissipation.base import Dissipation
 from ..dissipation.bath_conduction import BathConduction
 from ..dissipation.heating import Heating
 from ..dissipation.landau_lifshitz import LandauLifshitz
@@ -31,6 +31,7 @@ from ..functions.planes import energy_in_component_order, interaction_range, to_
 from ..functions.spheres import HalfSumOfSquares, Spheres
 from .base import System
 from .baths import HeatBaths, poisson_with_baths
+from .interface import TorqueLaws
 from .torque import TorqueSystem, torque_name
 
 SPIN_LENGTHS_NAME = "sum |s|^2 / 2"
@@ -132,20 +133,10 @@ class SpinSystem(TorqueSystem):
     # -- the torque -----------------------------------------------------------------------------------------------
 
     @property
-    def has_torque(self) -> bool:
-        return self.torque is not None or bool(self.power)
-
-    @property
-    def torque_name(self) -> str:
-        return torque_name((*(self.torque or ()), *self.power))
-
-    @property
-    def torque_invariant_casimirs(self) -> frozenset[str]:
-        return frozenset(self.casimirs())  # a torque s x w keeps every length
-
-    @property
-    def torque_entropy_law(self) -> LawName:
-        return "nondecreasing" if self.power else "conserved"
+    def torque_laws(self) -> TorqueLaws:
+        """Name and laws of torques and powers; no Casimir changes, since a torque ``s x w`` keeps every length."""
+        name = torque_name((*(self.torque or ()), *self.power))
+        return TorqueLaws(name, bool(name), entropy_law="nondecreasing" if self.power else "conserved")
 
     def _torque_at(self, x, t, attitude):
         s = x[: self.body_dim].reshape(*self.lattice, 3)
