@@ -174,10 +174,10 @@ class ExplicitMethod(TransportingMethod):
         that spins but does not translate. Near these the rotation that would cancel an error is much larger than the
         error. Momenta of internal parts, such as a wheel with friction, do not matter for the attitude.
         """
-        orbit_dim, casimirs = system.orbit_levels
+        orbit_dim, casimirs, has_all_casimirs = system.orbit_levels
         # With a torque, the impulse is projected onto the orbit instead.
         casimirs_are_held = system.torque_laws.has_impulse or casimirs <= set(self.held)
-        return system.has_all_casimirs and casimirs_are_held and orbit_dim - len(casimirs) <= 2
+        return has_all_casimirs and casimirs_are_held and orbit_dim - len(casimirs) <= 2
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
         method_on_states = self._with_transformed_functions(

@@ -393,7 +393,7 @@ def _entropy_arguments(system: System) -> dict[str, Energy]:
     S = _entropy_with_a_law(system)
     if S is None:
         return {}
-    if S.is_quadratic or not system.has_all_casimirs:
+    if S.is_quadratic or not system.orbit_levels.has_all_casimirs:
         return {ENTROPY_KEY: S}
     return system.casimirs()
 

@@ -148,7 +148,7 @@ def common_inertia(family: Family) -> np.ndarray | None:
 
 def members_outside_domain(family: Family, states: np.ndarray) -> list[int]:
     """Return the members whose parameters do not allow their initial states, shape (B, n)."""
-    if family.member(0).domain_margin(jnp.asarray(states[0])) is None:
+    if family.member(0).domain.margin is None:
         return []
     parameters = family.parameter_matrix(slice(None), len(states))
     margins = evaluate_at_points(
@@ -369,7 +369,7 @@ def _bath_entropy_scales(model, row):
 def _domain_margin(model, row):
     form, p = model
     system, x = _member_and_state(form, p, row)
-    return system.domain_margin(x)
+    return system.domain.margin_at(x)
 
 
 def _inverse_inertia(model, row):

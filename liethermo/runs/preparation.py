@@ -189,7 +189,8 @@ def checked_initial_state(system: System, method, x0, t: float, attitude=None) -
 def why_not_startable(system: System, method, x) -> str:
     """Return why no run can start at x, a state or a batch of states; "" if it can."""
     ignores_singularity = has_generator(system) and (not isinstance(method, OneStepMethod) or method.explicit)
-    reason = system.outside(x) or ("" if ignores_singularity else system.why_singular(x))
+    domain = system.domain
+    reason = domain.why_outside(x) or ("" if ignores_singularity else domain.why_singular(x))
     return reason and f"the run cannot start at this x0: {reason}"
 
 

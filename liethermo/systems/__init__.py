@@ -8,6 +8,7 @@ from .chetaev import ChetaevSystem
 from .composed.bodies import Copies, Subsystem
 from .composed.matter import Membrane, Reaction
 from .composed.system import ComposedSystem
+from .domain import Domain
 from .driven import DrivenSystem, make_autonomous
 from .embedded import EmbeddedSystem, embed_in_arrays
 from .equilibria import Equilibria, Equilibrium, equilibria, steady_state
@@ -32,6 +33,7 @@ __all__ = [
     "ComposedSystem",
     "ContactSystem",
     "Copies",
+    "Domain",
     "DrivenSystem",
     "EmbeddedSystem",
     "Equilibria",

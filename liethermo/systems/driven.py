@@ -110,17 +110,10 @@ class DrivenSystem(LiftedSystem):
         times = scale * np.random.default_rng(seed).standard_normal(count)
         return np.column_stack([self.body.samples(count, seed, scale), self.unit * times, np.zeros(count)])
 
-    def outside(self, x) -> str:
-        return self._body_at_first_time(x).outside(x[..., :-2])
-
-    def why_singular(self, x) -> str:
-        return self._body_at_first_time(x).why_singular(x[..., :-2])
-
     def run_conditions(self, x, t, guarantees):
         return self.body.run_conditions(x[:, :-2], t, guarantees)
 
-    def _body_at_first_time(self, x) -> System:
-        """Return the body with its time frozen at that of the first of several states, which must not be traced."""
+    def _inner_at_first(self, x) -> System:
         t = float(np.reshape(x, (-1, self.dim))[0, -2]) / self.unit
         return self._body_at_time(min(max(t, float(self.span.start)), float(self.span.end)))
 

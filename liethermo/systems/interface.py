@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -19,6 +19,7 @@ from ..functions.surface import Surface
 from .baths import HeatBaths
 from .clock import Clock
 from .conditions import RunCondition
+from .domain import Domain
 
 
 class InvariantVerdicts(NamedTuple):
@@ -33,6 +34,40 @@ class InvariantVerdicts(NamedTuple):
         verdicts = {**verdicts, **{name: True for name in declared if verdicts.get(name, True) is None}}
         constant = {name for name, verdict in verdicts.items() if verdict}
         return cls(frozenset(constant), frozenset(name for name, verdict in verdicts.items() if verdict is None))
+
+
+class OrbitLevels(NamedTuple):
+    """Common levels of Casimirs that are the orbits of a group.
+
+    Attributes
+    ----------
+    n_momenta : int
+        Number of momenta that the group acts on.
+    casimirs : frozenset of str
+        Names of the Casimirs whose common levels are the orbits.
+    has_all_casimirs : bool
+        Whether every Casimir is known to be a function of the Casimirs of the system.
+    """
+
+    n_momenta: int
+    casimirs: frozenset[str]
+    has_all_casimirs: bool = False
+
+
+class SparseNewton(NamedTuple):
+    """Functions of a system for Newton's method with a sparse Jacobian; by default no pattern is known.
+
+    Attributes
+    ----------
+    find_pattern : function without arguments to a sparse array, shape (n, n), or None
+        Returns the sparsity pattern of the Jacobian of the field, for discrete gradients too; None if it is not known.
+    residual_weights : function from a state, shape (n,), to an array, shape (n,)
+        Returns factors that make the components of the field nearly linear in the state. The equations of a stiff step
+        are solved multiplied by these factors.
+    """
+
+    find_pattern: Callable[[], scipy.sparse.csr_array | None] = lambda: None
+    residual_weights: Callable[[Any], jax.Array] = jnp.ones_like
 
 
 class EngineHints(NamedTuple):
@@ -98,8 +133,6 @@ class SystemInterface(Geometry):
     baths: HeatBaths | None = eqx.field(kw_only=True, default=None)
     """Baths that take the heat of the dissipation; their entropies are the last components of a state."""
     production_name: ClassVar[str] = "dS/dt"
-    domain: ClassVar[str] = ""
-    """Condition, in words, that a state must satisfy beside finite components."""
 
     @property
     def kind(self) -> str:
@@ -173,27 +206,10 @@ class SystemInterface(Geometry):
         x[self.body_dim :] = 0.0
         return x
 
-    def outside(self, x) -> str:
-        """Explain why a state lies outside the domain of the system; "" if it lies inside.
-
-        For several states, shape (..., n), the text is about one that lies outside.
-        """
-        return ""
-
-    def domain_margin(self, x) -> jax.Array | None:
-        """Return a number that is positive if and only if the parameters of the system allow the state x, shape (n,).
-
-        JAX traces it, for many systems at once; :meth:`outside` explains it in words. None if all parameters allow
-        all states.
-        """
-        return None
-
-    def why_singular(self, x) -> str:
-        """Explain why the gradient of the entropy is infinite at x, so that no run can start there; "" if it is finite.
-
-        For several states, shape (..., n), the text is about one of them.
-        """
-        return ""
+    @property
+    def domain(self) -> Domain:
+        """Conditions that a state must satisfy beside finite components, with functions that explain them."""
+        return Domain()
 
     def run_conditions(self, x: np.ndarray, t: np.ndarray, guarantees: frozenset[str]) -> tuple[RunCondition, ...]:
         """Return conditions of a run beside its laws, such as positive density matrices, for the rows of an audit.
@@ -294,14 +310,9 @@ class SystemInterface(Geometry):
         return {}
 
     @property
-    def has_all_casimirs(self) -> bool:
-        """True if every Casimir is known to be a function of :meth:`casimirs`."""
-        return False
-
-    @property
-    def orbit_levels(self) -> tuple[int, frozenset[str]]:
-        """Number of momenta that the group acts on, and names of the Casimirs whose common levels are the orbits."""
-        return self.body_dim, frozenset(self.casimirs())
+    def orbit_levels(self) -> OrbitLevels:
+        """Casimirs whose common levels are the orbits of the group, and whether all Casimirs are known."""
+        return OrbitLevels(self.body_dim, frozenset(self.casimirs()))
 
     @property
     def surface(self) -> Surface | None:
@@ -343,19 +354,10 @@ class SystemInterface(Geometry):
         is_complex = self.space is not None and self.space.dtype.kind == "c"
         return EngineHints(can_unroll=is_smooth and not is_complex, is_smooth=is_smooth)
 
-    def sparsity_pattern(self) -> scipy.sparse.csr_array | None:
-        """Return the sparsity pattern of the Jacobian of the field, shape (n, n); None if it is not known.
-
-        It holds for discrete gradients too. Large systems with a pattern are solved by sparse Newton iteration.
-        """
-        return None
-
-    def residual_weights(self, x) -> jax.Array:
-        """Return factors, shape (n,), that make the components of the field nearly linear in the state.
-
-        Newton's method solves the equations of a stiff step multiplied by these factors.
-        """
-        return jnp.ones_like(x)
+    @property
+    def sparse_newton(self) -> SparseNewton:
+        """Functions for Newton's method with a sparse Jacobian, which solves large systems with a known pattern."""
+        return SparseNewton()
 
     def component_scales(self, k) -> jax.Array:
         """Return the scale of each component of slopes, shape (..., n), for finite differences: the largest of all."""

@@ -21,7 +21,7 @@ from ..tracing.caching import memoize
 from ..tracing.interpret import evaluate_at_points
 from .baths import BathEntropy, HeatBaths
 from .body_states import checked_velocity, entropies_of_temperatures, is_given_by_velocity, momentum_of_velocity
-from .interface import TORQUE_FREE_LAWS, TorqueLaws
+from .interface import TORQUE_FREE_LAWS, OrbitLevels, TorqueLaws
 from .torque import (
     MAX_ARGUMENTS,
     MIN_ARGUMENTS,
@@ -270,14 +270,12 @@ class LiePoissonSystem(TorqueSystem):
         return _leading_casimirs(self.algebra, self.algebra.basis_names)
 
     @property
-    def has_all_casimirs(self) -> bool:
-        return _spans_all_casimirs(self.algebra)
-
-    @property
-    def orbit_levels(self) -> tuple[int, frozenset[str]]:
-        if self.group is None:
-            return super().orbit_levels
-        return self.group.dim, _casimirs_of_first(self.algebra, self.algebra.basis_names, self.group.dim)
+    def orbit_levels(self) -> OrbitLevels:
+        n_momenta, casimirs, _ = super().orbit_levels
+        if self.group is not None:
+            n_momenta = self.group.dim
+            casimirs = _casimirs_of_first(self.algebra, self.algebra.basis_names, n_momenta)
+        return OrbitLevels(n_momenta, casimirs, _spans_all_casimirs(self.algebra))
 
 
 def _resolve_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str | None) -> str | None:

@@ -238,7 +238,7 @@ def _regular_kernel(system: System, x: np.ndarray, scale: float) -> np.ndarray |
     by_form = dissipation_keeps_casimirs(system)
     if not by_form or system.torque_laws.name or system.space is not None or system.baths is not None:
         return None
-    if system.has_all_casimirs or system.dim > MAX_TENSOR_DIM:
+    if system.orbit_levels.has_all_casimirs or system.dim > MAX_TENSOR_DIM:
         return None
     points = np.concatenate([x[None], system.samples(3, scale=scale)])
     tensors = evaluate_at_points(_poisson_tensor, system, points)

@@ -35,6 +35,7 @@ from .base import System
 from .baths import BathEntropy, HeatBaths, poisson_with_baths
 from .conditions import RunCondition
 from .density_states import checked_density_matrices, checked_parts, join_baths, tensor_with_identity
+from .domain import Domain
 from .equilibria import Equilibrium, steady_state
 from .hamiltonian import hamiltonian_energy
 from .interface import EngineHints, InvariantVerdicts
@@ -298,7 +299,11 @@ class QuantumSystem(System):
         """Return the completely mixed state, with baths at entropy zero."""
         return np.asarray(self.state(np.eye(self.structure.size) / self.structure.size))
 
-    def outside(self, x) -> str:
+    @property
+    def domain(self) -> Domain:
+        return Domain(why_outside=self._why_outside, why_singular=self._why_singular)
+
+    def _why_outside(self, x) -> str:
         if is_traced(self):
             return ""
         rho = self._density_matrices(x)
@@ -375,7 +380,7 @@ class QuantumSystem(System):
         affinity = np.asarray(self.structure.matrix(ascent.ascent_direction(self, x, self.energy.gradient(x), dS, dL)))
         return float(np.exp(np.linalg.eigvalsh(adjoint(kernel) @ affinity @ kernel)[-1] - 1.0))
 
-    def why_singular(self, x) -> str:
+    def _why_singular(self, x) -> str:
         if is_traced(self) or not self._has_dissipation(ThermalJumps):
             return ""
         x, rho = np.atleast_2d(x), self._density_matrices(x)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -27,7 +27,9 @@ from ...functions.energy import Energy, Function, Quadratic, TimeDependent
 from ...functions.indices import pattern_of_matrix, sparsity_pattern, union_pattern
 from ...functions.mechanics import is_independent_of, is_mechanical
 from ..base import System, name_momentum_maps
+from ..domain import Domain
 from ..evolution import entropy_component
+from ..interface import SparseNewton
 from ..states import evaluate_batch
 from .bodies import Copies, Subsystem, name_subsystems
 from .matter import Membrane, Reaction
@@ -93,8 +95,6 @@ class ComposedSystem(System):
     poisson: mf.ExtendedPhaseSpace
     subsystems: tuple[Subsystem | Copies, ...]
     labels: tuple[str, ...] = eqx.field(static=True)
-
-    domain: ClassVar[str] = "positive temperatures"
 
     def __init__(
         self,
@@ -190,7 +190,14 @@ class ComposedSystem(System):
                 factors = factors.at[..., i, j].set(factor).at[..., j, i].set(-factor)
         return factors
 
-    def outside(self, x) -> str:
+    @property
+    def domain(self) -> Domain:
+        def lowest_temperature(x):
+            return jnp.min(self.energy.gradient(x)[..., self._state_indices.S])
+
+        return Domain("positive temperatures", self._why_outside, margin=lowest_temperature)
+
+    def _why_outside(self, x) -> str:
         T = np.atleast_2d(self.temperatures(x)).min(axis=0)
         cold = np.flatnonzero(~(T > 0.0))
         if not cold.size:
@@ -201,10 +208,11 @@ class ComposedSystem(System):
             clauses.append(f"of {cold.size - MAX_NAMED_BODIES} more likewise")
         return f"{' and '.join(clauses)}: it has to be positive"
 
-    def domain_margin(self, x):
-        return jnp.min(self.energy.gradient(x)[..., self._state_indices.S])
+    @property
+    def sparse_newton(self) -> SparseNewton:
+        return SparseNewton(self._find_pattern, self._residual_weights)
 
-    def sparsity_pattern(self) -> scipy.sparse.csr_array | None:
+    def _find_pattern(self) -> scipy.sparse.csr_array | None:
         if self.poisson.species:
             return None
         patterns = [_poisson_pattern(self.poisson)]
@@ -216,7 +224,7 @@ class ComposedSystem(System):
         identity = scipy.sparse.eye_array(self.dim, dtype=bool, format="csr")
         return pattern_of_matrix((operator + identity) @ (hessian + identity))
 
-    def residual_weights(self, x) -> jax.Array:
+    def _residual_weights(self, x) -> jax.Array:
         """Return temperatures as weights of entropies: ``T S'`` is linear in the temperatures, unlike S'."""
         S = self._state_indices.S
         return jnp.ones_like(x).at[S].set(self.energy.gradient(x)[S])
