@@ -182,7 +182,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         """
         functions = self._held_functions(system) | _entropy_arguments(system)
         casimirs = functions.keys() <= {ENTROPY_KEY, *self._casimir_names(system)}
-        if system.dissipation is not None or not casimirs or all(C.is_quadratic for C in functions.values()):
+        if system.total_dissipation.terms or not casimirs or all(C.is_quadratic for C in functions.values()):
             return None
         dH = self._energy_gradients(system, self._stage_states(x, compensation, h, k), x, compensation, h, k)
         points = system.poisson.stages_on_leaf(x + compensation, dH, h * gauss_tableau(self.number).A)
@@ -238,7 +238,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         system = system.freeze_at(u)
         slope = self._conservative_slope(system, u, dH, gradients_by_name)
         keys_and_names = tuple(zip(preserved_by_name(system), preserved_names(system), strict=True))
-        for term, preserved_keys in terms_with_preserved_values(system.dissipations, keys_and_names):
+        for term, preserved_keys in terms_with_preserved_values(system.total_dissipation.terms, keys_and_names):
             slope = slope + self._dissipative_slope(term, preserved_keys, system, u, dH, dS, gradients_by_name)
         return slope
 
@@ -310,7 +310,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     def can_transport_attitude(self, system: System) -> bool:
         """Return whether the steps determine the attitude exactly: they do if nothing is projected off the slopes."""
         names = preserved_names(system)
-        terms = terms_with_preserved_values(system.dissipations, names)
+        terms = terms_with_preserved_values(system.total_dissipation.terms, names)
         has_only_quadratics = all(
             C.is_quadratic for C in (self._held_functions(system) | _entropy_arguments(system)).values()
         )
@@ -331,8 +331,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         """
         if name not in system.casimirs() and name not in preserved_names(system):
             return False
-        is_projected = system.dissipation is None or system.dissipation.is_symmetric
-        return is_projected or system.functions()[name].is_quadratic
+        return system.total_dissipation.is_symmetric or system.functions()[name].is_quadratic
 
     def _held_functions(self, system: System) -> dict[str, Energy]:
         """Return the held functions by name."""
@@ -403,8 +402,8 @@ def _entropy_with_a_law(system: System) -> Energy | None:
 
     A projection of the motion off its gradient would then only lower the order, where that gradient is infinite.
     """
-    dissipation = system.dissipation
-    has_no_part = dissipation is not None and dissipation.has_generator and not dissipation.needs_entropy
+    dissipation = system.total_dissipation
+    has_no_part = dissipation.has_generator and not dissipation.needs_entropy
     return None if has_no_part and system.entropy_law is None else system.entropy
 
 

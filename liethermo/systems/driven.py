@@ -13,7 +13,7 @@ import manifolds as mf
 from manifolds._pytree_module import forward_to, replace_fields
 from manifolds.structures.poisson import PoissonBySharp, ProductPoisson
 
-from ..dissipation.base import SkewFriction
+from ..dissipation.base import SkewFriction, dissipation_name, sum_dissipations
 from ..errors import InputError
 from ..functions.checks import with_polynomial_degrees
 from ..functions.coordinates import ComponentMap
@@ -77,7 +77,7 @@ class DrivenSystem(LiftedSystem):
         if body.torque_laws.name:
             has_law = body.entropy_law is not None or body.entropy is None
             torque = _TorqueForce(law=body.torque_laws.entropy_law if has_law else None)
-            self.dissipation = torque if self.dissipation is None else self.dissipation + torque
+            self.dissipation = sum_dissipations((*self.total_dissipation.terms, torque))
 
     @property
     def kind(self) -> str:
@@ -185,7 +185,7 @@ class DrivenSystem(LiftedSystem):
         entries = {"system": type(body).__name__, "x0": x[0].tolist() if solution.provenance.get("x0") else None}
         if body.lie_algebra is not None:
             entries["algebra"] = body.lie_algebra.name
-        entries["dissipation"] = None if body.dissipation is None else type(body.dissipation).__name__
+        entries["dissipation"] = dissipation_name(body.dissipation)
         energy = solution.energy + solution.casimirs[WORK_NAME]
         body_solution = dataclasses.replace(solution, x=x, energy=energy, dense=dense).with_provenance(**entries)
         return body.to_user_solution(body_solution)

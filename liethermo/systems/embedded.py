@@ -19,7 +19,7 @@ from manifolds._arrays import is_traced
 from manifolds._pytree_module import forward_to
 from manifolds.structures.poisson import PoissonBySharp
 
-from ..dissipation.base import LiftedDissipation, LiftedGeometry
+from ..dissipation.base import LiftedDissipation, LiftedGeometry, dissipation_name
 from ..functions.checks import with_polynomial_degrees
 from ..functions.energy import Energy
 from ..functions.surface import ConstraintSurface
@@ -106,10 +106,9 @@ class EmbeddedSystem(System):
     _around = forward_to("manifold")
 
     def to_user_solution(self, solution):
-        dissipation = self.manifold.dissipation
-        kind = None if dissipation is None else type(dissipation).__name__
+        name = dissipation_name(self.manifold.dissipation)
         return self.manifold.to_user_solution(
-            solution.with_provenance(system=type(self.manifold).__name__, dissipation=kind)
+            solution.with_provenance(system=type(self.manifold).__name__, dissipation=name)
         )
 
     # -- dynamics -----------------------------------------------------------------------------------------------------

@@ -315,7 +315,9 @@ def _level_names(
 
 def _is_damped(system: System, points: np.ndarray) -> bool:
     """Return whether the dissipation moves some of the points, shape (points, n); with rate zero it moves none."""
-    return system.dissipation is not None and bool(np.any(evaluate_at_points(_dissipative_velocity, system, points)))
+    return bool(system.total_dissipation.terms) and bool(
+        np.any(evaluate_at_points(_dissipative_velocity, system, points))
+    )
 
 
 def _dissipative_velocity(system: System, x):

@@ -13,7 +13,7 @@ import manifolds as mf
 from manifolds._arrays import is_traced
 from manifolds._pytree_module import Module
 
-from ..dissipation.base import Dissipation, sum_dissipations
+from ..dissipation.base import Dissipation, dissipation_terms
 from ..dissipation.force import EulerPoincareForce
 from ..errors import InputError
 from ..functions.checks import checked_energy
@@ -92,9 +92,7 @@ class EulerPoincareSystem(LiePoissonSystem):
         energy = make_energy(lagrangian, "the Lagrangian")
         self.lagrangian = checked_energy(energy, algebra.dim, "the Lagrangian", allow_time=True)
         if force is not None:
-            force_term = EulerPoincareForce(force)
-            dissipation = sum_dissipations(dissipation)
-            dissipation = force_term if dissipation is None else dissipation + force_term
+            dissipation = [*dissipation_terms(dissipation), EulerPoincareForce(force)]
         energy = _legendre_hamiltonian(self.lagrangian, algebra.dim)
         super().__init__(
             algebra, energy, entropy, dissipation, momentum_maps, validate, group, reconstruction, torque=torque

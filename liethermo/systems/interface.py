@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from ..dissipation.base import Dissipation, LawName
+from ..dissipation.base import ABSENT_DISSIPATION, Dissipation, LawName
 from ..dissipation.geometry import Geometry
 from ..functions.energy import Energy
 from ..functions.surface import Surface
@@ -284,26 +284,24 @@ class SystemInterface(Geometry):
     # -- laws ---------------------------------------------------------------------------------------------------------
 
     @property
-    def dissipations(self) -> tuple[Dissipation, ...]:
-        """The summands of the dissipation; () without one."""
-        return () if self.dissipation is None else self.dissipation.terms
+    def total_dissipation(self) -> Dissipation:
+        """The dissipation; of a system without dissipation a sum of no terms, which does nothing."""
+        return ABSENT_DISSIPATION if self.dissipation is None else self.dissipation
 
     @property
     def preserved(self) -> tuple[Energy, ...]:
         """Functions that the dissipation, or one of its summands, has to preserve beside the energy."""
-        return () if self.dissipation is None else self.dissipation.preserve
+        return self.total_dissipation.preserve
 
     @property
     def energy_law(self) -> LawName | None:
         """ "conserved", "nonincreasing" under double-bracket dissipation, or None where there is no guarantee."""
-        return "conserved" if self.dissipation is None else self.dissipation.energy_law
+        return self.total_dissipation.energy_law
 
     @property
     def entropy_law(self) -> LawName | None:
         """ "nondecreasing", "conserved", or None where there is no entropy or no guarantee."""
-        if self.entropy is None:
-            return None
-        return "conserved" if self.dissipation is None else self.dissipation.entropy_law
+        return None if self.entropy is None else self.total_dissipation.entropy_law
 
     def casimirs(self) -> dict[str, Energy]:
         """Return the known Casimirs of the Poisson structure, by name."""

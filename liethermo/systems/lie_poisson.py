@@ -148,11 +148,11 @@ class LiePoissonSystem(TorqueSystem):
 
     def _field_without_torque(self, x, dH, dS, dL):
         # all forces that are coadjoint actions are computed by one action, ad*_dH (x + F)
-        if self.dissipation is None or self.dissipation.added_momentum(dH, jnp.zeros_like(dH)) is None:
+        if self.total_dissipation.added_momentum(dH, jnp.zeros_like(dH)) is None:
             return super()._field_without_torque(x, dH, dS, dL)
         action = self.algebra.action(dH)
         bracket = jnp.zeros_like(dH) if dS is None else action.bracket(dS)
-        return action.ad_star(x + self.dissipation.added_momentum(dH, bracket))
+        return action.ad_star(x + self.total_dissipation.added_momentum(dH, bracket))
 
     @property
     def inertia(self) -> np.ndarray | None:

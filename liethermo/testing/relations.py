@@ -347,7 +347,7 @@ def nearby_state(case: RelationCase) -> np.ndarray:
 def check_reversal(case: RelationCase) -> SkipReason:
     """Check that a reversible motion returns to its start with the negative energy."""
     system = case.system
-    if system.dissipation is not None or system.is_driven:
+    if system.total_dissipation.terms or system.is_driven:
         return "the motion is not reversible"
     reversed_run = case.run(replace_parts(system, energy=-system.energy), case.base_run.x[-1])
     symmetric = not case.method.explicit and not isinstance(case.step, Adaptive)
@@ -403,9 +403,7 @@ def check_split_noise(case: RelationCase) -> SkipReason:
     ends = cut_times(case)
     if not ends:
         return "there are too few steps"
-    loses_energy = case.system.dissipation is not None and any(
-        part.energy_law != "conserved" for part in case.system.dissipation.terms
-    )
+    loses_energy = any(part.energy_law != "conserved" for part in case.system.total_dissipation.terms)
     noise = Fluctuations(NOISE_BOLTZMANN, seed=case.seed, temperature=1.0 if loses_energy else None)
     try:
         unsplit_run = case.run(noise=noise)

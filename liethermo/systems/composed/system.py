@@ -119,7 +119,7 @@ class ComposedSystem(System):
         structure = mf.ExtendedPhaseSpace(dofs, kinds if any(kinds) else ())
         energy = checked_energy(self._total_energy(structure, coupling), structure.dim, "the energy", allow_time=True)
         entropy = entropy_component(structure.dim, structure.state_indices.S)
-        dissipation = self._make_dissipation(structure, energy, conductance, drag, connected, conduction)
+        terms = self._make_dissipations(structure, energy, conductance, drag, connected, conduction)
         exchanges = [*(membranes if isinstance(membranes, list | tuple) else [membranes])]
         exchanges += [*(reactions if isinstance(reactions, list | tuple) else [reactions])]
         for item in exchanges:
@@ -129,10 +129,9 @@ class ComposedSystem(System):
                 )
         processes = [item.process(self.names, structure) for item in exchanges]
         if processes:
-            matter = MatterExchange(processes)
-            dissipation = matter if dissipation is None else dissipation + matter
+            terms.append(MatterExchange(processes))
         momentum_maps = {**_particle_invariants(structure, processes), **name_momentum_maps(momentum_maps)}
-        self._build(structure, structure.dim, energy, entropy, dissipation, momentum_maps, validate)
+        self._build(structure, structure.dim, energy, entropy, terms or None, momentum_maps, validate)
 
     # -- in parts -------------------------------------------------------------------------------------------------
 
@@ -180,7 +179,7 @@ class ComposedSystem(System):
         """
         beta = 1.0 / self.temperatures(x, t)
         factors = jnp.zeros((*beta.shape, beta.shape[-1]))
-        for term in self.dissipations:
+        for term in self.total_dissipation.terms:
             if isinstance(term, HeatConduction):
                 i, j = np.array(term.first_bodies, dtype=int), np.array(term.second_bodies, dtype=int)
                 k = jnp.vectorize(term.conductances, signature="(n),(e),(e)->(e)")(
@@ -215,10 +214,8 @@ class ComposedSystem(System):
     def _find_pattern(self) -> scipy.sparse.csr_array | None:
         if self.poisson.species:
             return None
-        patterns = [_poisson_pattern(self.poisson)]
-        if self.dissipation is not None:
-            patterns.append(self.dissipation.couplings(self))
-        operator, hessian = union_pattern(patterns), self.energy.couplings(self.dim)
+        patterns = (term.couplings(self) for term in self.total_dissipation.terms)
+        operator, hessian = union_pattern([_poisson_pattern(self.poisson), *patterns]), self.energy.couplings(self.dim)
         if operator is None or hessian is None:
             return None
         identity = scipy.sparse.eye_array(self.dim, dtype=bool, format="csr")
@@ -251,7 +248,7 @@ class ComposedSystem(System):
             ]
         return sum(terms[1:], terms[0])
 
-    def _make_dissipation(self, structure, energy, conductance, drag, connected, conduction) -> Dissipation | None:
+    def _make_dissipations(self, structure, energy, conductance, drag, connected, conduction) -> list[Dissipation]:
         terms: list[Dissipation] = []
         dofs = structure.degrees_of_freedom
         first_indices = np.cumsum([0, *(body.count for body in self.subsystems)])
@@ -286,7 +283,7 @@ class ComposedSystem(System):
             graph = graph_edges(drag, len(dofs), "the drag", self.names)
             _require_velocities(graph, dofs, self.names)
             terms.append(Drag(graph))
-        return sum(terms[1:], terms[0]) if terms else None
+        return terms
 
     def _friction_surely_produces_entropy(
         self, energy: Energy, structure: mf.ExtendedPhaseSpace, bodies: tuple[int, ...]
