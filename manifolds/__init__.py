@@ -14,8 +14,7 @@ from .algebras.catalogue import abelian, aff, bianchi, g2, galilei, gl, heisenbe
 from .algebras.formula import Formula
 from .algebras.invariants import TracePolynomial
 from .algebras.isomorphism_type import IsomorphismType
-from .algebras.killing import trilinear_form
-from .algebras.lie_algebra import LieAlgebra
+from .algebras.lie_algebra import LieAlgebra, trilinear_form
 from .algebras.magnetic import MagneticExtension, magnetic_extension
 from .algebras.matrix_algebra import MatrixAlgebra, MatrixTrace
 from .algebras.patera import patera

@@ -237,7 +237,7 @@ def check_halved_dissipation(case: RelationCase) -> SkipReason:
     """Check that a dissipation may be split into two with half of the rate each."""
     if case.system.dissipation is None:
         return "there is no dissipation"
-    run = case.run(replace_parts(case.system, dissipation=sum_of_two_halves(case.system.dissipation)))
+    run = case.run(replace_parts(case.system, dissipation=sum_of_two_halves(case.system)))
     case.compare_run("half of the rate, twice", run)
     rows, split_rows = ([row.law for row in s.audit().rows] for s in (case.base_run, run))
     case.suite.check_true(
