@@ -200,7 +200,7 @@ class ArticulatedBodies(Module):
         squares = jnp.sum(centres**2, axis=1)[:, None, None] * jnp.eye(3) - centres[:, :, None] * centres[:, None, :]
         rotational = self.central_inertias(poses) + masses[:, :, None] * squares
         inertias = jnp.concatenate([masses, masses * centres, rotational.reshape(-1, 9)], axis=1)
-        sums = self._bodies_beyond @ inertias
+        sums = jnp.asarray(self._bodies_beyond) @ inertias
         return SpatialInertias(sums[:, 0], sums[:, 1:4], sums[:, 4:].reshape(-1, 3, 3))
 
     def screws(self, poses: Poses) -> jax.Array:

@@ -17,7 +17,7 @@ from manifolds._pytree_module import replace_fields
 from manifolds.structures.poisson import ProductPoisson
 from manifolds.structures.spins import add_vectors, cross, cross_vectors, dot_vectors, scale_vectors, split_vectors
 
-from ..dissipation.base import Dissipation, LawName
+from ..dissipation.base import Dissipation
 from ..dissipation.heating import BathConduction, Heating
 from ..dissipation.landau_lifshitz import LandauLifshitz
 from ..errors import InputError
@@ -36,6 +36,7 @@ from ..functions.on_spaces import (
 )
 from .base import System
 from .baths import HeatBaths, poisson_with_baths
+from .interface import TorqueLaws
 from .torque import TorqueSystem, torque_name
 
 SPIN_LENGTHS_NAME = "sum |s|^2 / 2"
@@ -118,7 +119,7 @@ class SpinSystem(TorqueSystem):
 
     def _field_without_torque(self, x, dH, dS, dL):
         # precession and damping of the spins are added before they are stored in a state
-        parts, spins, n = _split_damping(self.dissipation), self._spin_structure, self.body_dim
+        parts, spins, n = _split_damping(self.total_dissipation), self._spin_structure, self.body_dim
         if parts is None or spins is None:
             return super()._field_without_torque(x, dH, dS, dL)
         damping, heating, conduction = parts
@@ -137,20 +138,10 @@ class SpinSystem(TorqueSystem):
     # -- the torque -----------------------------------------------------------------------------------------------
 
     @property
-    def has_torque(self) -> bool:
-        return self.torque is not None or bool(self.power)
-
-    @property
-    def torque_name(self) -> str:
-        return torque_name((*(self.torque or ()), *self.power))
-
-    @property
-    def torque_invariant_casimirs(self) -> frozenset[str]:
-        return frozenset(self.casimirs())  # a torque s x w keeps every length
-
-    @property
-    def torque_entropy_law(self) -> LawName:
-        return "nondecreasing" if self.power else "conserved"
+    def torque_laws(self) -> TorqueLaws:
+        """Name and laws of torques and powers; no Casimir changes, since a torque ``s x w`` keeps every length."""
+        name = torque_name((*(self.torque or ()), *self.power))
+        return TorqueLaws(name, bool(name), entropy_law="nondecreasing" if self.power else "conserved")
 
     def _torque_at(self, x, t, attitude):
         s = x[: self.body_dim].reshape(*self.lattice, 3)
@@ -226,7 +217,7 @@ class SpinSystem(TorqueSystem):
         system = self.at_time(t)
         gradient, s = system.energy.gradient(state), np.asarray(state[:n]).reshape(-1, 3)
         field = np.linalg.norm(np.asarray(gradient[:n]).reshape(-1, 3), axis=1)
-        parts = _split_damping(self.dissipation)
+        parts = _split_damping(self.total_dissipation)
         rate = np.zeros(()) if parts is None else np.abs(np.asarray(parts.damping.rate)).ravel()
         damping_rate = rate * np.linalg.norm(s, axis=1)
         turning_rate = float((np.hypot(np.ravel(spins.ratio), damping_rate) * field).max())
@@ -295,7 +286,8 @@ def reorder_spins(system: System) -> ReorderedSystem | None:
     if type(system) is not SpinSystem:
         return None
     spins = system._spin_structure
-    is_reorderable = system.dissipation is None or _split_damping(system.dissipation) is not None
+    dissipation = system.total_dissipation
+    is_reorderable = not dissipation.terms or _split_damping(dissipation) is not None
     if not is_reorderable or spins is None or spins.is_component_major or system.is_driven:
         return None
     count = spins.count
@@ -344,14 +336,13 @@ class _DampingParts(NamedTuple):
     conduction: tuple[BathConduction, ...]
 
 
-def _split_damping(dissipation: Dissipation | None) -> _DampingParts | None:
+def _split_damping(dissipation: Dissipation) -> _DampingParts | None:
     """Return a dissipation as its damping and its heat conduction between baths, if any; None for another dissipation.
 
     It is None for subclasses, whose force may differ.
     """
-    terms = () if dissipation is None else dissipation.terms
-    conduction = tuple(term for term in terms if type(term) is BathConduction)
-    others = [term for term in terms if type(term) is not BathConduction]
+    conduction = tuple(term for term in dissipation.terms if type(term) is BathConduction)
+    others = [term for term in dissipation.terms if type(term) is not BathConduction]
     if len(others) != 1:
         return None
     heating = others[0] if type(others[0]) is Heating else None
