@@ -23,7 +23,7 @@ from .baths import BathEntropy, HeatBaths
 from .body_states import checked_velocity, entropies_of_temperatures, is_given_by_velocity, momentum_of_velocity
 from .torque import (
     MAX_ARGUMENTS,
-    MIN_ARGUMENTS,
+    MAX_ARGUMENTS_WITHOUT_ATTITUDE,
     TorqueSystem,
     begins_with_rotations,
     check_torque,
@@ -244,7 +244,7 @@ class LiePoissonSystem(TorqueSystem):
 
     @property
     def needs_attitude(self) -> bool:
-        return self.torque is not None and max(self.torque_argument_counts) > MIN_ARGUMENTS
+        return self.torque is not None and max(self.torque_argument_counts) > MAX_ARGUMENTS_WITHOUT_ATTITUDE
 
     def _torque_at(self, x, t, attitude):
         if attitude is not None:  # without it XLA crashes on products of many such matrices with vectors
