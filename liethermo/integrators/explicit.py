@@ -362,7 +362,7 @@ class ExplicitMethod(TransportingMethod):
         Wheels and joints move the body also where the momentum of the whole is zero. It is 0 if there are no internal
         parts, or if the method does not hold the Casimirs of the momentum.
         """
-        dim, casimirs = system.orbit_levels
+        dim, casimirs, _ = system.orbit_levels
         return dim if casimirs and casimirs <= set(self.held) and dim < system.body_dim else 0
 
     def _can_follow_symplectic_leaf(self, system: System) -> bool:
