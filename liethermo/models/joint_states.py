@@ -23,10 +23,11 @@ from ..tracing.programs import jit_unoptimised
 from .articulated_bodies import ArticulatedBodies, JointDamping, JointSprings, KineticEnergy, Motion
 from .parameters import checked_finite
 
-MAX_UNROLLED_JOINTS = 4
-"""Largest number of joint coordinates for which the compiled engine is chosen by itself.
+MAX_UNROLLED_NEWTON_JOINTS = 4
+"""Largest number of joint coordinates for which the compiled engine is chosen by itself for implicit methods.
 
-Steps of larger trees are compiled in seconds too, but Newton's method, which a step may need later, takes minutes."""
+Their steps for larger trees are compiled in seconds too, but Newton's method, which one may need later, takes minutes.
+"""
 
 JointRange = tuple[str, int, int]
 """Name of a body that has a joint, and the first and the last but one index of its coordinates in a state."""
@@ -80,7 +81,7 @@ class TreeSystem(System):
 
     @property
     def hints(self) -> EngineHints:
-        return super().hints._replace(can_unroll=self.mechanism.n_joints <= MAX_UNROLLED_JOINTS)
+        return super().hints._replace(can_unroll_newton=self.mechanism.n_joints <= MAX_UNROLLED_NEWTON_JOINTS)
 
     @with_library_settings
     def mass_matrix(self, q) -> jax.Array:

@@ -77,6 +77,8 @@ class EngineHints(NamedTuple):
     ----------
     can_unroll : bool
         Whether the compiled engine is worth trying; False if the system needs a loop.
+    can_unroll_newton : bool
+        Whether it is worth trying for methods too whose steps may need Newton's method.
     has_matrix_functions : bool
         Whether the system consists of matrix functions, which XLA compiles more slowly than the compiled engine.
     is_smooth : bool
@@ -84,6 +86,7 @@ class EngineHints(NamedTuple):
     """
 
     can_unroll: bool = True
+    can_unroll_newton: bool = True
     has_matrix_functions: bool = False
     is_smooth: bool = True
 

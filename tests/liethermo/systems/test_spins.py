@@ -416,7 +416,7 @@ REFUSED_CALLS = [
     (lambda: small_lattice(bath=np.array([0, 0, 1])), "a dissipation heats bath 1, but there are 1 baths"),
     (lambda: small_lattice(bath=np.array([0, 0])), "of the shape .3,. of the sites"),
     (lambda: lt.HeatBaths(-1.0), r"must be positive, not \[-1.0\]"),
-    (lambda: lt.HeatBaths([1.0, 2.0]), r"1 baths is one number, or has shape \(1,\)"),
+    (lambda: lt.HeatBaths([1.0, 2.0], number=1), r"1 baths is one number, or has shape \(1,\)"),
     (lambda: small_lattice(baths=2.0), "baths must be lt.HeatBaths, True"),
     (
         lambda: lt.LiePoissonSystem(mf.so(3), lambda s: s[0] ** 2, dissipation=lt.LandauLifshitz()),
