@@ -369,7 +369,8 @@ class PauseHandler:
         return [np.array(group) for group in groups.values()]
 
     def resume_paused(self) -> None:
-        """Resume the trajectories at a stop, finish those at their end, and compute missing growth rates."""
+        """Resume trajectories that paused, finish those that have reached their end, and compute missing growth
+        rates."""
         runs, status = self.adaptive_runs, self.adaptive_runs.read("status")
         at_stop = np.flatnonzero(status == StatusCode.PAUSED_AT_STOP)
         if at_stop.size:

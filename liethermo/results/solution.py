@@ -183,7 +183,8 @@ class _DeferredField:
 
 
 def deferred_fields(*names: str) -> Callable[[Class], Class]:
-    """Decorate a dataclass: the values of these fields may be given by :func:`defer`."""
+    """Decorate a dataclass so that the listed fields may hold a value of :func:`defer`, which is computed when it is
+    read."""
 
     def add_descriptors(cls: Class) -> Class:
         for name in names:

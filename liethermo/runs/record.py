@@ -566,7 +566,8 @@ class EnsembleEvidenceCollector:
 def _sampled_saved_states(
     record: EnsembleRecord, sample: np.ndarray
 ) -> tuple[Sequence[np.ndarray] | np.ndarray, np.ndarray]:
-    """Return saved states of trajectories with these numbers, shape (sample, times, n), and times spread over the run.
+    """Return saved states of the trajectories with these indices, shape (sample, times, n), at times spread over the
+    run.
 
     Both are empty if the run keeps no states.
     """

@@ -73,7 +73,8 @@ def functions_for_naming(system: SystemInterface) -> tuple[Energy, ...]:
 
 
 def names_from_multiples(system: SystemInterface, multiples: Sequence[int]) -> tuple[str, ...]:
-    """Return the name of each preserved function: that of the function it is a multiple of, or its own.
+    """Return a name for each preserved function: that of a known function of which it is a multiple, or else its
+    own.
 
     Parameters
     ----------
