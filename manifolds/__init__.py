@@ -12,8 +12,7 @@ from .algebras.blocks import DirectSum, direct_sum, power, semidirect_sum
 from .algebras.casimirs import NoPolynomialCasimirWarning, TracePolynomial
 from .algebras.catalogue import abelian, aff, bianchi, g2, galilei, gl, heisenberg, registered, se, sl, so, sp, su, u
 from .algebras.isomorphism_type import IsomorphismType
-from .algebras.killing import trilinear_form
-from .algebras.lie_algebra import LieAlgebra
+from .algebras.lie_algebra import LieAlgebra, trilinear_form
 from .algebras.magnetic import MagneticExtension, magnetic_extension
 from .algebras.matrix_algebra import MatrixAlgebra, MatrixTrace
 from .algebras.patera import patera

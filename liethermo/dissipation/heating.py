@@ -156,7 +156,7 @@ def _body_inner_geometry(system: Geometry, x) -> LiftedGeometry:
 
 
 def couple_to_baths(
-    dissipation: Dissipation | None,
+    dissipation: Dissipation,
     body: Geometry,
     n_baths: int,
     has_positive_temperatures: bool,
@@ -169,7 +169,7 @@ def couple_to_baths(
     InputError
         If no summand produces heat, or a summand names a bath that does not exist.
     """
-    terms = () if dissipation is None else dissipation.terms
+    terms = dissipation.terms
     if not any(term.energy_law == "nonincreasing" for term in terms):
         reason = f"{type(terms[0]).__name__} does not lower the energy" if terms else "the system has no dissipation"
         raise InputError(

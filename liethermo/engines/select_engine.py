@@ -196,7 +196,7 @@ class EngineWithFallback:
         if self.requested_engine == "sparse" or (
             is_auto and system.dim >= MIN_SPARSE_DIM and not method.explicit and self.noise is None
         ):
-            if system.sparsity_pattern() is not None:
+            if system.sparse_newton.find_pattern() is not None:
                 return SparseEngine(system, method)
             if not is_auto:
                 raise InputError(

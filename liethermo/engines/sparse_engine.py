@@ -232,7 +232,7 @@ class SparseEngine:
 
     def __init__(self, system: System, method: OneStepMethod):
         self.system, self.method = system, method
-        pattern = system.sparsity_pattern()
+        pattern = system.sparse_newton.find_pattern()
         if pattern is None:
             raise ValueError(f"{type(system).__name__} does not know its sparsity")
         self._pattern = pattern
@@ -394,13 +394,13 @@ def _finish_step_program(system: System, method: OneStepMethod, state: State, h,
 def _weighted_residual_guess_and_scale(system: System, method: OneStepMethod, state: State, h):
     """Return the function ``k -> w (slopes(k) - k)``, a guess of k, and the scale that updates are compared with.
 
-    With the weights w of :meth:`liethermo.System.residual_weights` a stiff step is nearest to linear.
+    With the weights w of :attr:`liethermo.System.sparse_newton` a stiff step is nearest to linear.
     """
     slopes, guess, scale, *_ = _stage_equations(system, method, state, h)
 
     def residual(k):
         midpoint = state.x + (state.compensation + 0.5 * method.increment(h, k))
-        return system.residual_weights(midpoint) * (slopes(k) - k)
+        return system.sparse_newton.residual_weights(midpoint) * (slopes(k) - k)
 
     return residual, guess, scale
 
@@ -414,7 +414,9 @@ def _weighted_residual_and_scale(system: System, method: OneStepMethod, state: S
 @jit_cached
 def _residual_rounding_scale(system: System, method: OneStepMethod, x) -> Any:
     """Return the scale at which the weighted residual is rounded."""
-    return jnp.max(value_and_rounding_scale(lambda x: system.residual_weights(x) * system.vector_field(x), x)[1])
+    return jnp.max(
+        value_and_rounding_scale(lambda x: system.sparse_newton.residual_weights(x) * system.vector_field(x), x)[1]
+    )
 
 
 @jit_cached

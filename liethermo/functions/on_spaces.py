@@ -236,7 +236,7 @@ class PlanarSpinEnergy(Energy):
         total, *other_gradients = (energy.lattice_gradients(spins[energy.sites]) for energy in self.spin_energies)
         for gradient in other_gradients:
             total = add_vectors(total, reshape_vectors(gradient, total[0].shape))
-        return flatten_covectors(total, x, planar=True)
+        return flatten_covectors(jax.lax.optimization_barrier(total), x, planar=True)
 
     def _padded_spins_by_shape(self, x) -> dict[tuple[int, ...], PaddedLattice]:
         """Return the spins on the lattice of each energy, by the shape of the lattice."""

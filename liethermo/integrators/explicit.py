@@ -174,10 +174,10 @@ class ExplicitMethod(TransportingMethod):
         that spins but does not translate. Near these the rotation that would cancel an error is much larger than the
         error. Momenta of internal parts, such as a wheel with friction, do not matter for the attitude.
         """
-        orbit_dim, casimirs = system.orbit_levels
+        orbit_dim, casimirs, has_all_casimirs = system.orbit_levels
         # With a torque, the impulse is projected onto the orbit instead.
-        casimirs_are_held = system.has_impulse or casimirs <= set(self.held)
-        return system.has_all_casimirs and casimirs_are_held and orbit_dim - len(casimirs) <= 2
+        casimirs_are_held = system.torque_laws.has_impulse or casimirs <= set(self.held)
+        return has_all_casimirs and casimirs_are_held and orbit_dim - len(casimirs) <= 2
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
         method_on_states = self._with_transformed_functions(
@@ -224,7 +224,7 @@ class ExplicitMethod(TransportingMethod):
         leaf, n, skip_law_rates = (
             self._can_follow_symplectic_leaf(system),
             x.shape[0],
-            has_generator(system) or system.dissipation is None,
+            has_generator(system) or not system.total_dissipation.terms,
         )
         laws = self._laws(system, leaf)
         start_gradients = [law.function.gradient(x + compensation) for law in laws]
@@ -258,6 +258,7 @@ class ExplicitMethod(TransportingMethod):
                 changes[selection],
                 self.max_corrections,
                 leaf,
+                self._constant_momentum_dim(system),
             )
 
         d, residual = (
@@ -306,7 +307,7 @@ class ExplicitMethod(TransportingMethod):
             return jnp.stack(is_small).all()
 
         def achievable_changes() -> jax.Array:
-            directions = correction_directions(system, x, gradients, leaf)
+            directions = correction_directions(system, x, gradients, leaf, self._constant_momentum_dim(system))
             correction = level_correction(system, directions, drifts, gives_small_displacement)
             return jnp.stack([jnp.dot(v, correction) for v in directions])
 
@@ -339,11 +340,11 @@ class ExplicitMethod(TransportingMethod):
         if has_generator(system):
             return generator_field(system, x), jnp.zeros(len(laws))
         dH = system.energy.gradient(x)
-        if system.dissipation is None:
+        if not system.total_dissipation.terms:
             return system.field(x, dH, jnp.zeros_like(x)), jnp.zeros(len(laws))
         dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
         dL = tuple(L.gradient(x) for L in system.preserved)
-        terms = list(terms_with_preserved_values(system.dissipations, dL))
+        terms = list(terms_with_preserved_values(system.total_dissipation.terms, dL))
 
         def rate_by_dissipation(law: Law) -> jax.Array:
             """Return the rate by dissipation alone: near rest the motion would add rounding noise."""
@@ -355,13 +356,22 @@ class ExplicitMethod(TransportingMethod):
 
         return system.field(x, dH, dS, dL), jnp.stack([rate_by_dissipation(law) for law in laws])
 
+    def _constant_momentum_dim(self, system: System) -> int:
+        """Return the number of leading components that are a momentum on its coadjoint orbit beside internal parts.
+
+        Wheels and joints move the body also where the momentum of the whole is zero. It is 0 if there are no internal
+        parts, or if the method does not hold the Casimirs of the momentum.
+        """
+        dim, casimirs, _ = system.orbit_levels
+        return dim if casimirs and casimirs <= set(self.held) and dim < system.body_dim else 0
+
     def _can_follow_symplectic_leaf(self, system: System) -> bool:
         """Return True if a step can follow the symplectic leaf, on which all Casimirs are constant.
 
         This requires a structure that knows its leaves, and a Casimir that is not quadratic: the gradients of such
         Casimirs depend on each other at many states.
         """
-        if system.dissipation is not None:
+        if system.total_dissipation.terms:
             return False
         casimirs = [C for name, C in system.casimirs().items() if name in self.held]
         casimirs += [] if system.entropy is None else [system.entropy]

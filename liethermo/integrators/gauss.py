@@ -224,7 +224,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         """
         functions = self._held_functions(system) | _entropy_arguments(system)
         casimirs = functions.keys() <= {ENTROPY_KEY, *self._casimir_names(system)}
-        if system.dissipation is not None or not casimirs or all(C.is_quadratic for C in functions.values()):
+        if system.total_dissipation.terms or not casimirs or all(C.is_quadratic for C in functions.values()):
             return None
         dH = self._energy_gradients(system, self._stage_states(x, compensation, h, k), x, compensation, h, k)
         points = system.poisson.stages_on_leaf(x + compensation, dH, h * gauss_tableau(self.number).A)
@@ -280,7 +280,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         system = system.freeze_at(u)
         slope = self._conservative_slope(system, u, dH, gradients_by_name)
         keys_and_names = tuple(zip(preserved_by_name(system), preserved_names(system), strict=True))
-        for term, preserved_keys in terms_with_preserved_values(system.dissipations, keys_and_names):
+        for term, preserved_keys in terms_with_preserved_values(system.total_dissipation.terms, keys_and_names):
             slope = slope + self._dissipative_slope(term, preserved_keys, system, u, dH, dS, gradients_by_name)
         return slope
 
@@ -352,7 +352,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     def can_transport_attitude(self, system: System) -> bool:
         """Return whether the steps determine the attitude exactly: they do if nothing is projected off the slopes."""
         names = preserved_names(system)
-        terms = terms_with_preserved_values(system.dissipations, names)
+        terms = terms_with_preserved_values(system.total_dissipation.terms, names)
         has_only_quadratics = all(
             C.is_quadratic for C in (self._held_functions(system) | _entropy_arguments(system)).values()
         )
@@ -373,8 +373,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         """
         if name not in system.casimirs() and name not in preserved_names(system):
             return False
-        is_projected = system.dissipation is None or system.dissipation.is_symmetric
-        return is_projected or system.functions()[name].is_quadratic
+        return system.total_dissipation.is_symmetric or system.functions()[name].is_quadratic
 
     def _held_functions(self, system: System) -> dict[str, Energy]:
         """Return the held functions by name."""
@@ -435,7 +434,7 @@ def _entropy_arguments(system: System) -> dict[str, Energy]:
     S = _entropy_with_a_law(system)
     if S is None:
         return {}
-    if S.is_quadratic or not system.has_all_casimirs:
+    if S.is_quadratic or not system.orbit_levels.has_all_casimirs:
         return {ENTROPY_KEY: S}
     return system.casimirs()
 
@@ -445,8 +444,8 @@ def _entropy_with_a_law(system: System) -> Energy | None:
 
     A projection of the motion off its gradient would then only lower the order, where that gradient is infinite.
     """
-    dissipation = system.dissipation
-    has_no_part = dissipation is not None and dissipation.has_generator and not dissipation.needs_entropy
+    dissipation = system.total_dissipation
+    has_no_part = dissipation.has_generator and not dissipation.needs_entropy
     return None if has_no_part and system.entropy_law is None else system.entropy
 
 

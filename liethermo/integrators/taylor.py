@@ -112,7 +112,7 @@ class MetriplecticTaylor(ExplicitMethod):
         super().check(system)
         x = jnp.asarray(system.samples(1)[0])
         functions = {"the energy": system.energy.value, "the vector field": system.vector_field}
-        if system.entropy is not None and system.dissipation is not None and not has_generator(system):
+        if system.entropy is not None and system.total_dissipation.terms and not has_generator(system):
             functions["the entropy"] = system.entropy.value
         for name, function in functions.items():
             try:

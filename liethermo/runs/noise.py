@@ -308,7 +308,6 @@ MEASURE_ROW = "the motion keeps the measure"
 
 def _noise_residuals(model: tuple[System, Energy | None], x):
     system, density = model
-    assert system.dissipation is not None
 
     def motion(y):
         return system.poisson.sharp(y, system.energy.gradient(y))
@@ -318,7 +317,7 @@ def _noise_residuals(model: tuple[System, Energy | None], x):
         terms = jnp.append(terms, jnp.dot(density.gradient(x), motion(x)))
     scale = jnp.max(jnp.abs(terms)) + jnp.max(jnp.abs(motion(x))) / (1.0 + jnp.max(jnp.abs(x)))
     measure_residual = {MEASURE_ROW: jnp.abs(jnp.sum(terms)) / jnp.where(scale > 0.0, scale, 1.0)}
-    return factor_check_residuals(system.dissipation, system, x) | measure_residual
+    return factor_check_residuals(system.total_dissipation, system, x) | measure_residual
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from .base import System
 from .baths import HeatBaths
 from .composed.bodies import Copies, Membrane, Reaction, Subsystem
 from .composed.system import ComposedSystem
+from .domain import Domain
 from .driven import DrivenSystem, make_autonomous
 from .embedded import ChartSystem, EmbeddedSystem, embed_in_arrays
 from .equilibria import Equilibria, Equilibrium, equilibria, steady_state
@@ -28,6 +29,7 @@ __all__ = [
     "ComposedSystem",
     "ContactSystem",
     "Copies",
+    "Domain",
     "DrivenSystem",
     "EmbeddedSystem",
     "Equilibria",

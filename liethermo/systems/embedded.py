@@ -19,13 +19,14 @@ from manifolds._arrays import is_traced
 from manifolds._pytree_module import forward_to
 from manifolds.structures.poisson import PoissonBySharp
 
-from ..dissipation.base import LiftedDissipation, LiftedGeometry
+from ..dissipation.base import LiftedDissipation, LiftedGeometry, dissipation_name
 from ..functions.checks import with_polynomial_degrees
 from ..functions.energy import Energy
 from ..functions.surface import ConstraintSurface
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.programs import subprogram
 from .base import System
+from .domain import Domain
 from .interface import EngineHints
 
 TANGENCY_RTOL = 1e-12
@@ -70,8 +71,9 @@ class EmbeddedSystem(System):
     kind = forward_to("manifold")
 
     @property
-    def domain(self) -> str:  # type: ignore[override]
-        return f"a point of {_require_space(self.manifold).name}"
+    def domain(self) -> Domain:
+        name, why_singular = _require_space(self.manifold).name, self.manifold.domain.why_singular
+        return Domain(f"a point of {name}", self._why_outside, why_singular)
 
     ledger = forward_to("manifold")
 
@@ -84,19 +86,18 @@ class EmbeddedSystem(System):
     def surface(self) -> ConstraintSurface:
         return ConstraintSurface(_require_space(self.manifold), self.is_tangent)
 
-    def outside(self, x) -> str:
+    def _why_outside(self, x) -> str:
         space, x = _require_space(self.manifold), np.atleast_2d(x)
         if not np.isfinite(x).all():
             return ""
         is_inside = evaluate_at_points(_inside_indicator, self.surface, x) > 0.0
         if is_inside.all():
-            return self.manifold.outside(x)
+            return self.manifold.domain.why_outside(x)
         point = np.asarray(self.points(x[is_inside.argmin()]))
         return f"the step leaves {space.name}: {space._why_off_space(point, np.inf)}"
 
     # -- states -------------------------------------------------------------------------------------------------------
 
-    why_singular = forward_to("manifold")
     points = forward_to("manifold")
     state_array = forward_to("manifold")
     energy_of_vectors = forward_to("manifold")
@@ -105,10 +106,9 @@ class EmbeddedSystem(System):
     _around = forward_to("manifold")
 
     def to_user_solution(self, solution):
-        dissipation = self.manifold.dissipation
-        kind = None if dissipation is None else type(dissipation).__name__
+        name = dissipation_name(self.manifold.dissipation)
         return self.manifold.to_user_solution(
-            solution.with_provenance(system=type(self.manifold).__name__, dissipation=kind)
+            solution.with_provenance(system=type(self.manifold).__name__, dissipation=name)
         )
 
     # -- dynamics -----------------------------------------------------------------------------------------------------

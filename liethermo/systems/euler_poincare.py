@@ -16,7 +16,7 @@ from manifolds._pytree_module import Module
 from manifolds.matrices.linear import solve
 from manifolds.structures.poisson import PoissonBySharp
 
-from ..dissipation.base import Dissipation, sum_dissipations
+from ..dissipation.base import Dissipation, dissipation_terms
 from ..dissipation.friction import EulerPoincareForce
 from ..errors import InputError
 from ..functions.checks import checked_energy, with_polynomial_degrees
@@ -99,9 +99,7 @@ class EulerPoincareSystem(LiePoissonSystem):
         energy = make_energy(lagrangian, "the Lagrangian")
         self.lagrangian = checked_energy(energy, algebra.dim, "the Lagrangian", allow_time=True)
         if force is not None:
-            force_term = EulerPoincareForce(force)
-            dissipation = sum_dissipations(dissipation)
-            dissipation = force_term if dissipation is None else dissipation + force_term
+            dissipation = [*dissipation_terms(dissipation), EulerPoincareForce(force)]
         energy = _legendre_hamiltonian(self.lagrangian, algebra.dim)
         super().__init__(
             algebra, energy, entropy, dissipation, momentum_maps, validate, group, reconstruction, torque=torque

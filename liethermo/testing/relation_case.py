@@ -145,6 +145,6 @@ def nearby_state(case: RelationCase) -> np.ndarray:
     """Return another state at a twentieth of the state scale, or if that is outside, on the way to a random state."""
     v = np.random.default_rng(case.seed + 1).standard_normal(case.x0.shape)
     nearby = case.x0 + 0.05 * case.state_scale * v / np.linalg.norm(v)
-    if not case.system.outside(nearby.ravel()):
+    if not case.system.domain.why_outside(nearby.ravel()):
         return nearby
     return case.x0 + 0.05 * (random_start(case.system, case.seed + 1).reshape(case.x0.shape) - case.x0)

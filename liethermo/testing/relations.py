@@ -110,7 +110,7 @@ def check_halved_dissipation(case: RelationCase) -> SkipReason:
     """Check that a dissipation may be split into two with half of the rate each."""
     if case.system.dissipation is None:
         return "there is no dissipation"
-    run = case.run(replace_parts(case.system, dissipation=sum_of_two_halves(case.system.dissipation)))
+    run = case.run(replace_parts(case.system, dissipation=sum_of_two_halves(case.system)))
     case.compare_run("half of the rate, twice", run)
     rows, split_rows = ([row.law for row in s.audit().rows] for s in (case.base_run, run))
     case.suite.check_true(
@@ -211,7 +211,7 @@ def check_uncoupled_pair(case: RelationCase) -> SkipReason:
 def check_reversal(case: RelationCase) -> SkipReason:
     """Check that a reversible motion returns to its start with the negative energy."""
     system = case.system
-    if system.dissipation is not None or system.is_driven:
+    if system.total_dissipation.terms or system.is_driven:
         return "the motion is not reversible"
     reversed_run = case.run(replace_parts(system, energy=-system.energy), case.base_run.x[-1])
     symmetric = not case.method.explicit and not isinstance(case.step, Adaptive)

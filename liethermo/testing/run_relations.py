@@ -71,9 +71,7 @@ def check_split_noise(case: RelationCase) -> SkipReason:
     ends = cut_times(case)
     if not ends:
         return "there are too few steps"
-    loses_energy = case.system.dissipation is not None and any(
-        part.energy_law != "conserved" for part in case.system.dissipation.terms
-    )
+    loses_energy = any(part.energy_law != "conserved" for part in case.system.total_dissipation.terms)
     noise = Fluctuations(NOISE_BOLTZMANN, seed=case.seed, temperature=1.0 if loses_energy else None)
     try:
         unsplit_run = case.run(noise=noise)

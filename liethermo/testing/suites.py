@@ -53,7 +53,7 @@ def rebuild_pytree(tree):
 def random_start(system: System, seed: int) -> np.ndarray:
     """Return a random state inside the domain of the system, shape (n,)."""
     for x in system.samples(20, seed):
-        if not system.outside(jnp.asarray(x)) and np.isfinite(_field_at_time_zero(system, x)).all():
+        if not system.domain.why_outside(jnp.asarray(x)) and np.isfinite(_field_at_time_zero(system, x)).all():
             return np.asarray(x)
     raise ValueError(f"none of 20 random states is inside the domain of this {system.kind}: give x0")
 

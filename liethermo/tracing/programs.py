@@ -150,13 +150,24 @@ MAX_CACHED_SUBPROGRAMS = 512
 _subprogram_cache: LRUCache[Callable] = LRUCache(MAX_CACHED_SUBPROGRAMS)
 
 
+LOOP_XLA_OPTIONS = {
+    "xla_disable_hlo_passes": "cse_barrier_expander",
+    "xla_cpu_enable_concurrency_optimized_scheduler": False,
+}
+"""Options for a program that runs often, such as the loop of the steps.
+
+XLA drops optimisation barriers on the CPU before it fuses loops, and then computes a field once for each place that
+uses it; without this pass they hold. Loops over some thousand numbers are shorter than it takes to start one on another
+core, so they run one after another. Each loop over a large array still uses all cores.
+"""
+
 UNOPTIMISED_XLA_OPTIONS = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 """Options for a program that runs once or twice: optimising it, or fusing its loops, takes longer than it saves."""
 
 
 def jit_cached(function: FunctionT) -> FunctionT:
     """Decorator: compile a function of pytrees; arrays are its arguments, and other leaves are part of the program."""
-    return _jit_with_options(function, None)
+    return _jit_with_options(function, LOOP_XLA_OPTIONS)
 
 
 def jit_unoptimised(function: FunctionT) -> FunctionT:
@@ -217,9 +228,10 @@ def _compile(function: Callable, arguments: tuple, options: dict | None) -> Call
     call Python, or that run on accelerators or on several devices, are not cached, nor any if JAX's own cache is on:
     a program that comes from there cannot be written again.
     """
-    jitted = jax.jit(function, compiler_options=options)
     devices = jax.devices()
-    if len(devices) > 1 or devices[0].platform != "cpu" or getattr(jax.config, "jax_compilation_cache_dir"):  # noqa: B009
+    is_cpu = devices[0].platform == "cpu"
+    jitted = jax.jit(function, compiler_options=options if is_cpu else None)
+    if len(devices) > 1 or not is_cpu or getattr(jax.config, "jax_compilation_cache_dir"):  # noqa: B009
         return jitted
     lowered = jitted.lower(arguments)
     text = lowered.as_text()

@@ -69,6 +69,11 @@ def _checked_table(brackets: Mapping) -> dict[tuple[str, str], Combination]:
 def _combination(value, pair: tuple[str, str]) -> Combination:
     """Return the value of a bracket, a name or a dictionary or 0, without its zero coefficients."""
     if isinstance(value, str):
+        if not value.removeprefix("-").strip().isidentifier():
+            raise ComponentError(
+                f"the bracket of {pair} must be one name such as 'e3' or '-e3', not {value!r}; a combination is a "
+                "dictionary such as {'e3': 2, 'e4': 1}"
+            )
         return {value.removeprefix("-").strip(): Fraction(-1 if value.startswith("-") else 1)}
     if isinstance(value, Real) and value == 0:
         return {}

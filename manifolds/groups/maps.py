@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from .._arguments import checked_size
 from ..algebras._subspaces import RANK_TOLERANCE, numerical_null_space
@@ -301,7 +302,7 @@ class IndependentEquations:
     Attributes
     ----------
     function : callable
-        The equations, matrix (n, n) to array.
+        The equations, matrix (n, n) to array, or to a list of arrays.
     combinations : tuple of tuple of float
         Rows of coefficients.
     """
@@ -310,7 +311,7 @@ class IndependentEquations:
     combinations: tuple[tuple[float, ...], ...]
 
     def __call__(self, g) -> jax.Array:
-        return jnp.asarray(self.combinations) @ jnp.ravel(self.function(g))
+        return jnp.asarray(self.combinations) @ ravel_pytree(self.function(g))[0]
 
     def newton_step(self, g) -> jax.Array:
         """Return the least change of one matrix that solves the linearised equations, shape (n, n)."""
@@ -347,11 +348,11 @@ def fields_from_equations(function: Callable, n: int, name: str) -> dict[str, An
     n = checked_size(n, 1, "MatrixGroup.from_equations(f, n)")
     identity = jnp.eye(n)
     try:
-        residual = np.ravel(np.asarray(function(identity), dtype=np.float64))
-        derivative = np.asarray(jax.jacfwd(lambda a: jnp.ravel(function(a)))(identity)).reshape(-1, n * n)
+        residual = np.asarray(ravel_pytree(function(identity))[0], dtype=np.float64)
+        derivative = np.asarray(jax.jacfwd(lambda a: ravel_pytree(function(a))[0])(identity)).reshape(-1, n * n)
     except TypeError as error:
         raise ParameterError(
-            f"f must be a function by jax.numpy from a real matrix ({n}, {n}) to a real array: {error}"
+            f"f must be a function by jax.numpy from a real matrix ({n}, {n}) to real arrays: {error}"
         ) from None
     if not np.abs(residual).max(initial=0.0) <= IDENTITY_TOLERANCE:
         raise ParameterError(
@@ -369,7 +370,7 @@ def fields_from_equations(function: Callable, n: int, name: str) -> dict[str, An
     equations = IndependentEquations(function, tuple(map(tuple, combinations.tolist())))
     x = np.random.default_rng(0).standard_normal((4, algebra.dim))
     for matrix in np.asarray(jax.scipy.linalg.expm(algebra.hat(x) / np.linalg.norm(algebra.hat(x)))):
-        residual = np.abs(np.asarray(function(jnp.asarray(matrix)))).max()
+        residual = np.abs(np.asarray(ravel_pytree(function(jnp.asarray(matrix)))[0])).max()
         if not residual <= EXPONENTIAL_TOLERANCE * max(1.0, scale):
             raise ClosureError(
                 f"the solutions of f are no group: exponentials of its algebra miss them by {residual:.3g} (tolerance "

@@ -121,8 +121,8 @@ class MatrixGroup(metaclass=ListedType):
         Parameters
         ----------
         f : callable
-            Function of one matrix by jax.numpy, shape (n, n), to an array of any shape. Equations may depend on each
-            other.
+            Function of one matrix by jax.numpy, shape (n, n), to an array of any shape, or to a list of them. Equations
+            may depend on each other.
         n : int
             The size of the matrices.
         name : str

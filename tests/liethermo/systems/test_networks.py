@@ -158,7 +158,7 @@ def test_the_compressed_jacobian_is_the_jacobian(method):
     """With a hub that is found by pulling back; and every entry of the pattern is one that can occur."""
     n, h = 12, 0.1
     system = network(n)
-    pattern, x = system.sparsity_pattern(), jnp.asarray(random_state(n))
+    pattern, x = system.sparse_newton.find_pattern(), jnp.asarray(random_state(n))
     slopes = eqx.filter_jit(lambda k: method.slopes(system, x, 0.0 * x, h, k))
     k = jnp.asarray(np.random.default_rng(1).standard_normal((method.stages, 3 * n)))
     compression = sparse_engine.JacobianCompression(pattern, method.stages)
@@ -259,7 +259,7 @@ def test_the_sparse_engine_needs_a_sparsity():
     """The sparse one, asked for where the sparsity is not known: an error says why."""
     bodies = [lt.Subsystem(lambda x: jnp.exp(x[0]), 1) for _ in range(2)]
     coupled = lt.ComposedSystem(bodies, lt.Function(lambda y: y[0] ** 2).on(lambda x: x[:1] - x[1:]), 1.0)
-    assert coupled.sparsity_pattern() is None
+    assert coupled.sparse_newton.find_pattern() is None
     with pytest.raises(
         lt.InputError, match=r"does not know its sparsity\. Build the system as a ComposedSystem of lt\.Copies"
     ):
