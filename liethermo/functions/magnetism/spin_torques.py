@@ -1,4 +1,4 @@
-"""What drives spins: torques by currents (Slonczewski, Zhang and Li, spin-orbit), and the power of a laser pulse."""
+"""Drives of spins: torques by currents (Slonczewski, Zhang and Li, spin-orbit), and the power of a laser pulse."""
 
 from __future__ import annotations
 
