@@ -231,8 +231,10 @@ def finish_step(
     failure_code = jnp.where(
         solution.converged | ~solution.is_finite, int(StatusCode.NON_FINITE), int(StatusCode.NOT_CONVERGED)
     )
-    components = system.solved_subsystem(x)[1]
-    residual_scale = jnp.maximum(options.norm_for_dim(components.size)(components), h * solution.slope_rounding)
+    components, end_components = system.solved_subsystem(x)[1], system.solved_subsystem(new_x)[1]
+    norm = options.norm_for_dim(components.size)
+    # the larger of both ends: a step from rest may start at the state zero
+    residual_scale = jnp.maximum(jnp.maximum(norm(components), norm(end_components)), h * solution.slope_rounding)
     residual = h * solution.residual / jnp.where(residual_scale > options.tiny, residual_scale, 1.0)
     iterations = solution.fixed_point_iterations + solution.newton_iterations
     mean_functional = 0.5 * (

@@ -258,6 +258,7 @@ class ExplicitMethod(TransportingMethod):
                 changes[selection],
                 self.max_corrections,
                 leaf,
+                self._constant_momentum_dim(system),
             )
 
         d, residual = (
@@ -306,7 +307,7 @@ class ExplicitMethod(TransportingMethod):
             return jnp.stack(is_small).all()
 
         def achievable_changes() -> jax.Array:
-            directions = correction_directions(system, x, gradients, leaf)
+            directions = correction_directions(system, x, gradients, leaf, self._constant_momentum_dim(system))
             correction = level_correction(system, directions, drifts, gives_small_displacement)
             return jnp.stack([jnp.dot(v, correction) for v in directions])
 
@@ -354,6 +355,15 @@ class ExplicitMethod(TransportingMethod):
             return law.sign * jnp.maximum(law.sign * rate, 0.0)
 
         return system.field(x, dH, dS, dL), jnp.stack([rate_by_dissipation(law) for law in laws])
+
+    def _constant_momentum_dim(self, system: System) -> int:
+        """Return the number of leading components that are a momentum on its coadjoint orbit beside internal parts.
+
+        Wheels and joints move the body also where the momentum of the whole is zero. It is 0 if there are no internal
+        parts, or if the method does not hold the Casimirs of the momentum.
+        """
+        dim, casimirs, _ = system.orbit_levels
+        return dim if casimirs and casimirs <= set(self.held) and dim < system.body_dim else 0
 
     def _can_follow_symplectic_leaf(self, system: System) -> bool:
         """Return True if a step can follow the symplectic leaf, on which all Casimirs are constant.

@@ -92,17 +92,15 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         z, dH, dS, dL = self.method.midpoint_and_gradients(system, x, compensation, h, k)
         factors_and_inputs = self._factors_and_inputs(system, z, dH, dL, h)
-        slope = system.field(z, dH, dS, dL) + sum(B.times(w) for B, w in factors_and_inputs)
+        field, noise = system.field(z, dH, dS, dL), [B.times(w) for B, w in factors_and_inputs]
         rotations = [
             B.spin_coefficients[..., None] * w.reshape(-1, 3)
             for B, w in factors_and_inputs
             if B.spin_coefficients is not None
         ]
-        if not rotations:
-            return slope[None]
-        # Solve for the rotation by noise at once: among many spins some rotate far, and the iteration would be slow.
-        change = system.solve_rotation(0.5 * h * sum(rotations), slope - k[0])
-        return (slope if change is None else k[0] + change)[None]
+        # Solve for the turn of each spin at once: among many spins some turn far, and the iteration would be slow.
+        change = system.solve_at_spins(z, dH, sum(rotations), 0.5 * h, [field, *noise, -k[0]]) if rotations else None
+        return (sum(noise, field) if change is None else k[0] + change)[None]
 
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
         z, dH, dS, dL = self.method.midpoint_and_gradients(system, x, compensation, h, k)

@@ -106,11 +106,13 @@ def project_onto_levels(
     target_changes,
     max_corrections: int = MAX_PROJECTION_ITERATIONS,
     leaf: bool = False,
+    momentum_dim: int = 0,
 ) -> tuple[jax.Array, jax.Array]:
     """Return the displacement nearest to d with the required changes of the functions, and its residual as a length.
 
     ``start_gradients`` are the gradients of the functions at x + compensation, ``target_changes`` the required changes.
-    With ``leaf`` the displacement is along the symplectic leaf, and d is the covector that carries the state.
+    With ``leaf`` the displacement is along the symplectic leaf, and d is the covector that carries the state. The first
+    ``momentum_dim`` components are a momentum of constant length, which corrections leave at zero.
 
     Near an equilibrium the entropy is almost the largest that the conserved functions allow. If a step overestimates
     the production, the levels may have no common point. Corrections along gradients that depend on each other would
@@ -173,7 +175,7 @@ def project_onto_levels(
         heat.
         """
         end_state = x + (compensation + s.d)
-        directions = correction_directions(system, end_state, end_gradients, leaf)
+        directions = correction_directions(system, end_state, end_gradients, leaf, momentum_dim)
         change_vectors = [system.raise_index(end_state, v) for v in end_gradients] if leaf else directions
         if len(blocks) == 1:
             lengths = jnp.stack([jnp.linalg.norm(v) for v in change_vectors])
@@ -296,7 +298,7 @@ def project_onto_levels(
         start_vectors = (
             [system.raise_index(begin, v) for v in start_gradients]
             if leaf
-            else correction_directions(system, begin, start_gradients)
+            else correction_directions(system, begin, start_gradients, momentum_dim=momentum_dim)
         )
     zero_residual = jnp.zeros(len(laws))
     start_d, start_correction = (jnp.zeros_like(d), -d) if leaf else (d, jnp.zeros_like(d))
@@ -324,11 +326,20 @@ def project_onto_levels(
     return s.d, s.surface_residual + residual_length(s, rounding)
 
 
-def correction_directions(system: System, x, gradients: Sequence[jax.Array], leaf: bool = False) -> list[jax.Array]:
+def correction_directions(
+    system: System, x, gradients: Sequence[jax.Array], leaf: bool = False, momentum_dim: int = 0
+) -> list[jax.Array]:
     """Return the directions, along the surface, in which functions with these gradients at x are corrected.
 
-    With ``leaf`` they are directions of the covectors that carry the state along its leaf.
+    With ``leaf`` they are directions of the covectors that carry the state along its leaf. A momentum of constant
+    length, the first ``momentum_dim`` components, has no directions at zero: the gradient of its length vanishes there,
+    so nothing else keeps a correction of the energy from moving it.
     """
+    if momentum_dim:
+        n = system.body_dim
+        is_zero = jnp.linalg.norm(x[:momentum_dim]) <= REST_RTOL * jnp.linalg.norm(x[:n])
+        is_fixed = is_zero & (jnp.arange(x.shape[0]) < momentum_dim)
+        gradients = [jnp.where(is_fixed, 0.0, gradient) for gradient in gradients]
     if leaf:
         gradients = [_symplectic_leaf_direction(system, x, gradient) for gradient in gradients]
     directions, surface = [system.raise_index(x, gradient) for gradient in gradients], system.surface

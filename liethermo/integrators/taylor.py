@@ -19,7 +19,7 @@ from ..tracing.taylor import TaylorSeriesError, check_taylor_series, increment_t
 from .base import OneStepMethod, register
 from .charts import resolve_retraction
 from .explicit import ExplicitMethod, StepRow, UncorrectedStep
-from .lobatto import lobatto_rule
+from .tableaus import lobatto_rule
 
 MIN_ORDER = 2
 """Lowest order of a Taylor method."""

@@ -15,7 +15,7 @@ from manifolds._pytree_module import Module
 
 from ..errors import InputError
 from ..systems import EulerPoincareClosedSystem, LiePoissonSystem
-from ..systems.torque import MIN_ARGUMENTS, check_torque, evaluate_torque, torque_name
+from ..systems.torque import MAX_ARGUMENTS_WITHOUT_ATTITUDE, check_torque, evaluate_torque, torque_name
 from .inertia import checked_inertia
 from .parameters import checked_positive
 from .rotors import reaction_wheels
@@ -108,7 +108,7 @@ def body_with_wheels(
     external = None
     if torque is not None:
         torque, counts = check_torque(torque, algebra, mf.SO(3))
-        if max(counts) > MIN_ARGUMENTS:
+        if max(counts) > MAX_ARGUMENTS_WITHOUT_ATTITUDE:
             raise InputError(
                 f"body_with_wheels follows no attitude, but its torque {torque_name(torque)} needs it. Give "
                 "attitude=True"

@@ -30,8 +30,8 @@ class Orbit(Module):
     ----------
     mean_motion : float, > 0
         ``n = sqrt(G M / a**3)`` (rad/s).
-    radius : float, > 0
-        Semi-major axis a (m).
+    radius : float, > 0, optional
+        Semi-major axis a (m). Gravity does not need it: it follows from the mean motion.
     eccentricity : float, 0 <= e < 1
     towards, normal : array, shape (3,)
         Directions in space, of any length and perpendicular: from the body to the centre at t = 0, and of the angular
@@ -41,22 +41,24 @@ class Orbit(Module):
     """
 
     mean_motion: jax.Array
-    radius: jax.Array
+    radius: jax.Array | None
     eccentricity: jax.Array
     towards: jax.Array
     normal: jax.Array
     anomaly: jax.Array
 
     def __init__(
-        self, mean_motion, radius=1.0, eccentricity=0.0, towards=(1.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), anomaly=0.0
+        self, mean_motion, radius=None, eccentricity=0.0, towards=(1.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), anomaly=0.0
     ):
         self.mean_motion = checked_positive(mean_motion, "mean_motion")
-        self.radius = checked_positive(radius, "radius")
+        self.radius = None if radius is None else checked_positive(radius, "radius")
         self.eccentricity, self.anomaly = checked_eccentricity(eccentricity), checked_numbers(anomaly, "anomaly", ())
         self.towards, self.normal = checked_perpendicular(towards, normal)
 
     def __call__(self, t) -> jax.Array:
         """Return the position relative to the centre at time t, shape (3,) (m)."""
+        if self.radius is None:
+            raise InputError("the orbit needs its radius (m): lt.torques.Orbit(mean_motion, radius=...)")
         direction, distance = direction_and_distance(self, t)
         return -self.radius * distance * direction
 
@@ -124,6 +126,8 @@ class DipoleField(Module):
             raise InputError(
                 f"orbit must be a function of t, such as lt.torques.Orbit(...), got {type(orbit).__name__}"
             )
+        if isinstance(orbit, Orbit) and orbit.radius is None:
+            raise InputError("the field depends on the radius of the orbit: lt.torques.Orbit(mean_motion, radius=...)")
         self.strength, self.orbit = checked_finite(strength, "strength", 3), orbit
         self.rotation = checked_finite(rotation, "rotation", 3)
 

@@ -16,17 +16,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._arguments import public_dir
 from manifolds._arrays import is_traced
-from manifolds._names import public_dir
 from manifolds._pytree_module import Module
 
 from ..errors import InputError
 from ..functions.conditions import checked_numbers, require_condition
-from ..functions.piecewise import PiecewiseConstant as FunctionPiecewiseConstant
-from ..functions.piecewise import Table, TableKind, kinks_of_table
-from ..functions.time_span import FunctionWithBreaks
+from ..functions.time_span import FunctionWithBreaks, Table, TableKind, kinks_of_table
+from ..functions.time_span import PiecewiseConstant as FunctionPiecewiseConstant
 from .inertia import checked_inertia
-from .orbits import DipoleField, Orbit, checked_eccentricity, checked_perpendicular, direction_and_distance, unit_vector
+from .orbits import DipoleField, Orbit, direction_and_distance, unit_vector
 from .parameters import checked_finite, checked_positive
 
 __all__ = [
@@ -101,12 +100,18 @@ class GravityGradient(Module):
         Principal moments of inertia of the body with all that it carries, or the tensor, in body axes (kg m^2).
     mean_motion : float, > 0, or an Orbit
         Mean angular velocity of the orbit, ``sqrt(G M / a^3)`` (rad/s); or the orbit, which has all the rest.
-    towards, normal : array, shape (3,)
-        Directions in space, of any length: to the centre at t = 0, and of the angular momentum of the orbit.
+    towards, normal : array, shape (3,); optional
+        Directions in space, of any length: to the centre at t = 0, (1, 0, 0) by default, and of the angular momentum
+        of the orbit, (0, 0, 1) by default.
     eccentricity : float, 0 <= e < 1, optional
         By default the orbit is circular.
-    anomaly : float
-        True anomaly at t = 0 (rad).
+    anomaly : float, optional
+        True anomaly at t = 0 (rad), 0 by default.
+
+    Raises
+    ------
+    InputError
+        If an argument cannot be used, or one that an Orbit has is given beside it.
     """
 
     inertia: jax.Array
@@ -116,26 +121,16 @@ class GravityGradient(Module):
     eccentricity: jax.Array | None
     anomaly: jax.Array | None
 
-    def __init__(
-        self,
-        inertia,
-        mean_motion,
-        towards=(1.0, 0.0, 0.0),
-        normal=(0.0, 0.0, 1.0),
-        eccentricity=None,
-        anomaly=0.0,
-    ):
+    def __init__(self, inertia, mean_motion, towards=None, normal=None, eccentricity=None, anomaly=None):
+        details = {"towards": towards, "normal": normal, "eccentricity": eccentricity, "anomaly": anomaly}
+        details = {name: value for name, value in details.items() if value is not None}
+        is_circular = eccentricity is None and not isinstance(mean_motion, Orbit)
+        if isinstance(mean_motion, Orbit) and details:
+            raise InputError(f"an Orbit has {' and '.join(details)} of its own: give them to lt.torques.Orbit")
+        orbit = mean_motion if isinstance(mean_motion, Orbit) else Orbit(mean_motion, **details)
         self.inertia = jnp.asarray(checked_inertia(inertia, allow_rod=True))
-        if isinstance(mean_motion, Orbit):
-            orbit = mean_motion
-            self.mean_motion, self.eccentricity, self.anomaly = orbit.mean_motion, orbit.eccentricity, orbit.anomaly
-            self.towards, self.normal = orbit.towards, orbit.normal
-            return
-        self.mean_motion = checked_positive(mean_motion, "mean_motion")
-        self.towards, self.normal = checked_perpendicular(towards, normal)
-        self.eccentricity = self.anomaly = None
-        if eccentricity is not None:
-            self.eccentricity, self.anomaly = checked_eccentricity(eccentricity), checked_finite(anomaly, "anomaly")
+        self.mean_motion, self.towards, self.normal = orbit.mean_motion, orbit.towards, orbit.normal
+        self.eccentricity, self.anomaly = (None, None) if is_circular else (orbit.eccentricity, orbit.anomaly)
 
     def __call__(self, t, mu, attitude):
         direction, distance = self._direction_and_distance(t)
@@ -400,6 +395,11 @@ class Motor(Module):
 
     def __call__(self, t, mu):
         moment = jnp.atleast_1d(self.moment(t) if callable(self.moment) else self.moment)
+        n_wheels = mu.shape[0] - 3
+        if moment.shape != (n_wheels,):
+            raise InputError(
+                f"Motor needs one torque for each wheel of the body, which has {n_wheels}, but got shape {moment.shape}"
+            )
         return jnp.concatenate([jnp.zeros(mu.shape[0] - moment.shape[0]), moment])
 
 

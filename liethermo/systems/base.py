@@ -19,10 +19,10 @@ from manifolds.structures.poisson import ProductPoisson
 from ..dissipation.base import Dissipation, dissipation_terms, sum_dissipations
 from ..dissipation.heating import couple_to_baths
 from ..errors import InputError
+from ..functions.bath_energy import BodyBathsEnergy
 from ..functions.checks import checked_energy, trace_energies, with_polynomial_degrees
 from ..functions.energy import Energy, make_energy
 from ..functions.on_spaces import energy_of_vectors, flatten_site_functions
-from ..functions.with_baths import BodyBathsEnergy
 from ..tracing.short_form import arguments_form
 from ..tracing.traced import trace_callables
 from .baths import BathEntropy, HeatBaths, poisson_with_baths

@@ -19,8 +19,8 @@ from ..errors import InputError
 from ..functions.bath_energy import BathEnergy, DrivenReservoirEnergy, ReservoirEnergy, bath_terms, make_bath_energy
 from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers
-from ..functions.each import Each
 from ..functions.energy import Energy, Sum
+from ..functions.mechanics import Each
 from ..tracing.short_form import short_form
 
 
@@ -42,8 +42,8 @@ class HeatBaths(Module):
         one function to a number > 0 or to an array, shape (number,), or a function for some of the baths, ``U = T(t)
         y``. A device that changes the temperature does the work ``y T'(t)``, which the ledger of a run has; the heat
         that the bath receives is ``T(t) y`` less this work.
-    number : int
-        The number of baths.
+    number : int, optional
+        The number of baths. By default there is one for each entry of the other arguments, or one.
     energy : function from y, a scalar, to a scalar; or a sequence with a function or None per bath; optional
         The energy of each bath as a function of its entropy y (energy / temperature), instead of the two numbers. It
         has to increase. Electrons with the capacity ``c T``, for example, have ``U = T y + y^2 / (2 c)``.
@@ -75,7 +75,10 @@ class HeatBaths(Module):
 
     __repr__ = short_form
 
-    def __init__(self, capacity=1.0, temperature=1.0, number: int = 1, energy=None):
+    def __init__(self, capacity=1.0, temperature=1.0, number: int | None = None, energy=None):
+        if number is None:
+            sequences = [v for v in (capacity, temperature, energy) if isinstance(v, list | tuple) or np.ndim(v) == 1]
+            number = max(map(len, sequences), default=1)
         if isinstance(number, bool) or not isinstance(number, int) or number < 1:
             raise InputError(f"the number of baths is a positive integer, not {number!r}")
         self.number = number

@@ -61,6 +61,8 @@ def checked_velocity(angular_velocity, rotor_rates, dim: int, batch: bool) -> ja
     n_rotors = dim - 3
     rates = jnp.zeros(n_rotors) if rotor_rates is None else checked_numbers(rotor_rates, "rotor_rates")
     rates = jnp.broadcast_to(rates, (n_rotors,)) if rates.ndim == 0 and n_rotors else rates
+    if rotor_rates is not None and not n_rotors:
+        raise InputError("rotor_rates= needs a body with rotors, such as lt.models.reaction_wheels")
     if rates.shape[-1:] != (n_rotors,) or (rates.ndim > 1 and not batch):
         raise InputError(
             f"rotor_rates must have shape ({'..., ' if batch else ''}{n_rotors},), one for each rotor, got "

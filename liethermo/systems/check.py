@@ -12,7 +12,7 @@ import numpy as np
 
 from manifolds._tables import TableRow, Tabular
 
-from ..dissipation.friction_operator import FRICTION_KERNEL_CHECK
+from ..dissipation.friction import FRICTION_KERNEL_CHECK
 from ..dissipation.geometry import project_tangent
 from ..dissipation.potential import CONVEXITY_CHECK, MINIMUM_AT_ZERO_CHECK
 from ..errors import AxiomError, CasimirError, InputError

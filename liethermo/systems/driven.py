@@ -16,8 +16,8 @@ from manifolds.structures.poisson import PoissonBySharp, ProductPoisson
 from ..dissipation.base import SkewFriction, dissipation_name, sum_dissipations
 from ..errors import InputError
 from ..functions.checks import with_polynomial_degrees
-from ..functions.coordinates import ComponentMap
 from ..functions.energy import ChartEnergy, Energy, Linear, Pullback, Quadratic, StateTimeEnergy, Sum
+from ..functions.indices import ComponentMap
 from ..functions.time_span import TimeSpan
 from .base import System
 from .clock import WORK_NAME, Clock
@@ -154,9 +154,10 @@ class DrivenSystem(LiftedSystem):
         """Return the system with a fixed torque, shape (body.dim,)."""
         return replace_fields(self, torque=torque)
 
-    def solve_rotation(self, angles, v):
-        u = self.body.solve_rotation(angles, v[:-2])
-        return None if u is None else jnp.concatenate([u, v[-2:]])
+    def solve_at_spins(self, x, dH, noise_rates, half_step, velocities):
+        body_velocities = [v[:-2] for v in velocities]
+        u = self.body.solve_at_spins(x[:-2], dH[:-2], noise_rates, half_step, body_velocities)
+        return None if u is None else jnp.concatenate([u, sum(v[-2:] for v in velocities)])
 
     def raise_index(self, x, alpha):
         """Return the direction of a correction along alpha, without components along the clock and the work."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, Self
@@ -278,13 +278,19 @@ class SystemInterface(Geometry):
 
     # -- spins ----------------------------------------------------------------------------------------------------
 
-    def solve_rotation(self, angles, v) -> jax.Array | None:
-        """Return u with ``u_i - angles_i x u_i = v_i`` at each spin, and ``u = v`` elsewhere; None without spins.
+    def solve_at_spins(self, x, dH, noise_rates, half_step, velocities: Sequence) -> jax.Array | None:
+        """Return u with ``u_i - half_step J_i u_i = v_i`` at each spin, and ``u = v`` elsewhere; None without spins.
+
+        J_i is the derivative by s_i, at the given gradient dH, of the velocity of spin i.
 
         Parameters
         ----------
-        angles : array, shape (sites, 3)
-        v : array, shape (n,)
+        x, dH : array, shape (n,)
+        noise_rates : array, shape (sites, 3) or (1, 3)
+            Angular velocities by noise (1 / time).
+        half_step : array, shape ()
+        velocities : sequence of arrays, shape (n,)
+            Summands of v.
         """
         return None
 

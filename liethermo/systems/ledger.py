@@ -19,10 +19,10 @@ from manifolds.structures.poisson import ProductPoisson
 from ..dissipation.base import LawName, SkewFriction
 from ..dissipation.checks import checked_semidefinite
 from ..errors import InputError
-from ..functions.arguments import ConstantFunction, LastArgumentIgnored, required_argument_count
 from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers, require_condition
 from ..functions.energy import Energy, Quadratic
+from ..functions.time_span import ConstantFunction, LastArgumentIgnored, required_argument_count
 from ..tracing.interpret import evaluate_at_points
 from .base import System
 from .domain import Domain

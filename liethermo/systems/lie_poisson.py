@@ -24,7 +24,7 @@ from .body_states import checked_velocity, entropies_of_temperatures, is_given_b
 from .interface import TORQUE_FREE_LAWS, MotionQuantities, OrbitLevels, TorqueLaws
 from .torque import (
     MAX_ARGUMENTS,
-    MIN_ARGUMENTS,
+    MAX_ARGUMENTS_WITHOUT_ATTITUDE,
     TorqueSystem,
     begins_with_rotations,
     check_torque,
@@ -244,7 +244,7 @@ class LiePoissonSystem(TorqueSystem):
         return TorqueLaws(
             torque_name(self.torque),
             has_impulse=not set(range(n_momenta)) <= set(free),
-            needs_attitude=max(self.torque_argument_counts) > MIN_ARGUMENTS,
+            needs_attitude=max(self.torque_argument_counts) > MAX_ARGUMENTS_WITHOUT_ATTITUDE,
             changed_casimirs=frozenset(self.momentum_casimirs()) - _casimirs_of_components(self.algebra, names, free),
         )
 

@@ -23,7 +23,7 @@ from ..functions.gradients import EPS
 from ..tracing.interpret import evaluate_at_points
 from .base import System
 from .conservation import dissipation_keeps_casimirs
-from .invariants import resolve_invariants_near, systems_at_test_times
+from .invariants import resolve_invariants_near, stack_gradients, systems_at_test_times
 from .leaf_stability import has_definite_integral, retract
 
 REST_RTOL = 1e-7
@@ -177,13 +177,9 @@ def conserved_functions(system: System, x) -> dict[str, Energy]:
     counters = counter_components(system)
     if not counters.size or not conserved:
         return conserved
-    gradients = evaluate_at_points(_gradients, tuple(conserved.values()), np.atleast_2d(np.asarray(x)))
+    gradients = evaluate_at_points(stack_gradients, tuple(conserved.values()), np.atleast_2d(np.asarray(x)))
     keeps = ~gradients[:, :, counters].any(axis=(0, 2))
     return {name: g for (name, g), keep in zip(conserved.items(), keeps, strict=True) if keep}
-
-
-def _gradients(functions: tuple[Energy, ...], x) -> jax.Array:
-    return jnp.stack([g.gradient(x) for g in functions])
 
 
 class Leaf(NamedTuple):
@@ -211,7 +207,7 @@ def leaf_at(
     rows, names = [], []
     if functions:
         samples = system.samples(3, scale=scale)
-        typical = np.linalg.norm(evaluate_at_points(_gradients, tuple(functions.values()), samples), axis=2)
+        typical = np.linalg.norm(evaluate_at_points(stack_gradients, tuple(functions.values()), samples), axis=2)
         typical_lengths = np.nanmedian(np.where(np.isfinite(typical), typical, np.nan), axis=0)
         for name, gradient, typical_length in zip(functions, gradients, typical_lengths, strict=True):
             length = np.linalg.norm(gradient)

@@ -22,6 +22,7 @@ from ..dissipation.operators import HasMatrix, checked_hermitian, level_gap_roun
 from ..dissipation.quantum import ThermalJumps
 from ..dissipation.steepest_ascent import SteepestEntropyAscent
 from ..errors import InputError
+from ..functions.bath_energy import BodyBathsEnergy
 from ..functions.density import (
     NEGATIVE_EIGENVALUE_LIMIT,
     IsolatedVonNeumann,
@@ -30,14 +31,12 @@ from ..functions.density import (
 )
 from ..functions.energy import Energy, Quadratic, Sum
 from ..functions.gradients import EPS
-from ..functions.with_baths import BodyBathsEnergy
 from .base import System
 from .baths import BathEntropy, HeatBaths, poisson_with_baths
 from .conditions import RunCondition
-from .density_states import checked_density_matrices, checked_parts, join_baths, tensor_with_identity
 from .domain import Domain
 from .equilibria import Equilibrium, steady_state
-from .hamiltonian import hamiltonian_energy
+from .hamiltonian import checked_density_matrices, checked_parts, hamiltonian_energy, join_baths, tensor_with_identity
 from .interface import EngineHints, InvariantVerdicts
 from .invariants import systems_at_test_times
 from .states import evaluate_batch

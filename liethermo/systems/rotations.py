@@ -120,7 +120,7 @@ def attitude_array(attitude: Any, group: mf.MatrixGroup | None) -> Any:
         return rotation_matrices(attitude)
     if not is_body_attitude or attitude is None or is_traced(attitude):
         return attitude
-    return rotation_matrices(attitude) if np.shape(attitude)[-2:] == (3, 3) else attitude
+    return rotation_matrices(attitude)
 
 
 def rotation_matrices(rotations: Any) -> np.ndarray | jax.Array:

@@ -18,24 +18,35 @@ from manifolds.structures.poisson import ProductPoisson
 from manifolds.structures.spins import add_vectors, cross, cross_vectors, dot_vectors, scale_vectors, split_vectors
 
 from ..dissipation.base import Dissipation
-from ..dissipation.bath_conduction import BathConduction
 from ..dissipation.geometry import HeatingSites
-from ..dissipation.heating import Heating
+from ..dissipation.heating import BathConduction, Heating
 from ..dissipation.landau_lifshitz import LandauLifshitz
 from ..errors import InputError
 from ..functions.checks import traced_function_and_shape
 from ..functions.energy import Energy
 from ..functions.magnetism.spin_energy import lattice_shape
 from ..functions.magnetism.spin_torques import check_spin_torque
-from ..functions.on_spaces import flatten_site_functions
-from ..functions.planes import energy_in_component_order, interaction_range, to_component_order, to_site_order
-from ..functions.spheres import HalfSumOfSquares, Spheres
+from ..functions.on_spaces import (
+    HalfSumOfSquares,
+    Spheres,
+    energy_in_component_order,
+    flatten_site_functions,
+    interaction_range,
+    to_component_order,
+    to_site_order,
+)
 from .base import System
 from .baths import HeatBaths, poisson_with_baths
 from .interface import TorqueLaws
 from .torque import TorqueSystem, torque_name
 
 SPIN_LENGTHS_NAME = "sum |s|^2 / 2"
+"""Name of the Casimir of spins."""
+
+MIN_DAMPING_FACTOR = 0.5
+"""Smallest factor of a spin in the equations that are solved spin by spin.
+
+It is below 1 only where a spin is turned away from its field, and would vanish in very long steps."""
 
 
 class SpinSystem(TorqueSystem):
@@ -161,17 +172,28 @@ class SpinSystem(TorqueSystem):
     def drop_baths(self):
         return _drop_power(super().drop_baths())
 
-    def solve_rotation(self, angles, v) -> jax.Array | None:
-        """Return u with ``u_i - angles_i x u_i = v_i`` at each spin, angles of shape (sites, 3), and u = v elsewhere.
+    def solve_at_spins(self, x, dH, noise_rates, half_step, velocities) -> jax.Array | None:
+        """Return u with ``u_i - half_step J_i u_i = v_i`` at each spin and u = v elsewhere, v the sum of velocities.
 
-        ``u = (v + a x v + (a . v) a) / (1 + |a|^2)``, as ``a . u = a . v``.
+        Noise, precession and damping turn s at the angular velocity ``w - gamma dH - lambda s x dH``, and damping has
+        the factor ``lambda s . dH`` besides. So ``c u - a x u = v`` with the angle a in half a step, which has the
+        solution ``u = (c v + a x v + (a . v) a / c) / (c^2 + |a|^2)``, as ``c a . u = a . v``.
         """
-        spins = self._spin_structure
+        spins, parts, n = self._spin_structure, _split_damping(self.total_dissipation), self.body_dim
         if spins is None:
             return None
-        a, r = split_vectors(angles), spins.split_covectors(v)
-        u = add_vectors(add_vectors(r, cross_vectors(a, r)), scale_vectors(dot_vectors(a, r), a))
-        return spins.join_state(scale_vectors(1.0 / (1.0 + dot_vectors(a, a)), u), v[self.body_dim :])
+        s, gradient, c = spins.split_covectors(x), spins.split_covectors(dH), jnp.ones(())
+        precession = scale_vectors(-half_step * spins.ratio.reshape(-1), gradient)
+        a = add_vectors(split_vectors(half_step * noise_rates), precession)
+        if parts is not None:
+            signs = 1.0 if parts.heating is None else parts.heating.temperature_signs(dH[n:])
+            rate = -half_step * signs * parts.damping.rate.reshape(-1)
+            a = add_vectors(a, scale_vectors(rate, cross_vectors(s, gradient)))
+            c = jnp.maximum(1.0 + rate * dot_vectors(s, gradient), MIN_DAMPING_FACTOR)
+        v = functools.reduce(add_vectors, map(spins.split_covectors, velocities))
+        u = add_vectors(add_vectors(scale_vectors(c, v), cross_vectors(a, v)), scale_vectors(dot_vectors(a, v) / c, a))
+        others = sum(velocity[n:] for velocity in velocities)
+        return spins.join_state(scale_vectors(1.0 / (c * c + dot_vectors(a, a)), u), others)
 
     def largest_step(self, x, angle: float = 0.3, boltzmann: float = 0.0, t: float = 0.0) -> float:
         """Return the step (time) in which no spin turns by more than an ``angle``, in its field or by noise.

@@ -15,8 +15,7 @@ import manifolds as mf
 from manifolds._pytree_module import replace_fields
 
 from ..errors import FunctionError, InputError
-from ..functions.arguments import required_argument_count
-from ..functions.piecewise import is_spline
+from ..functions.time_span import is_spline, required_argument_count
 from ..tracing.interpret import MAX_UNROLLED_DIM, vanishing_entry_indices
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import TracedFunction, trace_callables_and_result_shapes
@@ -92,8 +91,8 @@ def check_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | Non
     Raises
     ------
     InputError, FunctionError
-        If it is no function of (t, mu), (t, mu, attitude) or (t, mu, attitude, velocity) to a dual vector; or if there
-        is no attitude.
+        If it is no function of t, (t, mu), (t, mu, attitude) or (t, mu, attitude, velocity) to a dual vector; or if
+        there is no attitude.
     """
     if given is None:
         return None, ()
@@ -101,8 +100,10 @@ def check_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | Non
     if not terms:
         raise InputError("torque is an empty list: a system without a torque is given None")
     counts = tuple(map(_checked_argument_count, terms))
-    if max(counts) > MIN_ARGUMENTS and group is None:
-        name = torque_name(next(term for term, n in zip(terms, counts, strict=True) if n > MIN_ARGUMENTS))
+    if max(counts) > MAX_ARGUMENTS_WITHOUT_ATTITUDE and group is None:
+        name = torque_name(
+            next(term for term, n in zip(terms, counts, strict=True) if n > MAX_ARGUMENTS_WITHOUT_ATTITUDE)
+        )
         raise InputError(f"the torque {name} depends on the attitude: give the system a group, such as group=mf.SO(3)")
     shapes = _argument_shapes(algebra, group)
 
@@ -113,6 +114,8 @@ def check_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | Non
     given = terms if isinstance(given, list) else given
     try:
         torque, values = trace_callables_and_result_shapes(given, evaluate_terms, *shapes)
+    except InputError:  # of a torque of the library, which says what it needs
+        raise
     except TRACE_ERRORS as error:
         what = f"the torque could not be evaluated on a momentum of shape {algebra.shape}"
         raise FunctionError(trace_error_message(what, error)) from error
@@ -192,8 +195,8 @@ def _evaluate_terms(torque: Any, counts: tuple[int, ...], t, mu, attitude, veloc
     return [term(*arguments[:count]) for term, count in terms]
 
 
-MIN_ARGUMENTS = 2
-"""Smallest number of arguments of a torque: t and mu."""
+MAX_ARGUMENTS_WITHOUT_ATTITUDE = 2
+"""Number of arguments above which a torque depends on the attitude: t alone, or t and mu, need none."""
 
 MAX_ARGUMENTS = 4
 """Largest number of arguments of a torque: after t and mu the attitude, then the velocity ``dH/dmu``."""
@@ -202,7 +205,7 @@ MAX_ARGUMENTS = 4
 def _checked_argument_count(term: Any) -> int:
     if not callable(term):
         raise InputError(
-            "a torque is a function of t and mu, or of t, mu and the attitude, such as "
+            "a torque is a function of t, of t and mu, or of t, mu and the attitude, such as "
             f"lt.torques.ConstantInBody([0.0, 0.0, 1.0]), not {type(term).__name__}"
         )
     if is_spline(term):
@@ -210,9 +213,9 @@ def _checked_argument_count(term: Any) -> int:
             f"a spline is a table of a torque: write lt.torques.Tabulated(spline), not {torque_name(term)}"
         )
     count = len(term.program.argument_avals) if isinstance(term, TracedFunction) else required_argument_count(term)
-    if count is None or not MIN_ARGUMENTS <= count <= MAX_ARGUMENTS:
+    if count is None or not 1 <= count <= MAX_ARGUMENTS:
         raise InputError(
-            f"a torque is a function of t and mu, or of t, mu and the attitude, or of these and the velocity dH/dmu, "
-            f"and {torque_name(term)} needs {'an unknown number of' if count is None else count} arguments"
+            "a torque is a function of t, of t and mu, or of t, mu and the attitude, or of these and the velocity "
+            f"dH/dmu, but {torque_name(term)} needs {'an unknown number of' if count is None else count} arguments"
         )
     return count

@@ -6,7 +6,7 @@ import numpy as np
 import scipy
 
 from ..errors import LieAlgebraError
-from ._basis_scaling import STRUCTURE_TOLERANCE
+from .axioms import STRUCTURE_TOLERANCE
 
 
 def killing_form_of(constants: np.ndarray) -> np.ndarray:

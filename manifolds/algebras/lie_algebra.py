@@ -16,18 +16,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._arguments import checked_names
 from .._arrays import is_traced, real_array, real_components, square_matrices
-from .._names import checked_names
 from ..errors import ComponentError, LieAlgebraError, ParameterError, ShapeError
-from ._basis_scaling import STRUCTURE_TOLERANCE, balance_constants
 from ._rational import RationalArray, rational_array
-from .actions import Action, AdMatrixAction, Operator, terms_to_unroll, unrolled_bracket
-from .axioms import check_axioms, checked_constants, constants_and_matrices, real_columns
-from .bracket_table import constants_and_names
+from .axioms import (
+    STRUCTURE_TOLERANCE,
+    balance_constants,
+    check_axioms,
+    checked_constants,
+    constants_and_matrices,
+    real_columns,
+)
+from .bracket_table import algebra_html, constants_and_names
 from .casimirs import DEFAULT_MAX_DEGREE, casimirs, casimirs_up_to, check_invariant, leading_casimirs
-from .display import algebra_html
 from .killing import cartan_involution_of, killing_form_of, row_space_basis
 from .polynomial_casimirs import casimir_count
+from .structure import Action, AdMatrixAction, Operator, terms_to_unroll, unrolled_bracket
 from .structure_methods import CasimirInBasis, StructureMethods, constants_in_basis
 
 

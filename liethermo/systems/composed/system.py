@@ -14,25 +14,31 @@ import scipy
 import manifolds as mf
 from manifolds._arrays import is_traced
 from manifolds._pytree_module import Module
-from manifolds.structures.extended import StateIndices
+from manifolds.structures.poisson import StateIndices
 
 from ...dissipation.base import Dissipation, nondecreasing_if
-from ...dissipation.bodies import ContactFriction, Drag, HeatConduction, LinearFriction
-from ...dissipation.matter import MatterExchange, Process, conserved_number_combinations
+from ...dissipation.bodies import (
+    ContactFriction,
+    Drag,
+    HeatConduction,
+    LinearFriction,
+    MatterExchange,
+    Process,
+    conserved_number_combinations,
+)
 from ...errors import InputError
-from ...functions.arguments import ConstantFunction, LastArgumentIgnored, required_argument_count
 from ...functions.checks import checked_energy, traced_function_and_shape
 from ...functions.edges import Edges, connected_component_labels, graph_edges
 from ...functions.energy import Energy, Function, Quadratic, TimeDependent
 from ...functions.indices import pattern_of_matrix, sparsity_pattern, union_pattern
 from ...functions.mechanics import is_independent_of, is_mechanical
+from ...functions.time_span import ConstantFunction, LastArgumentIgnored, required_argument_count
 from ..base import System, name_momentum_maps
 from ..domain import Domain
 from ..evolution import entropy_component
 from ..interface import SparseNewton
 from ..states import evaluate_batch
-from .bodies import Copies, Subsystem, name_subsystems
-from .matter import Membrane, Reaction
+from .bodies import Copies, Membrane, Reaction, Subsystem, name_subsystems
 
 
 class ComposedSystem(System):

@@ -197,6 +197,29 @@ def test_motor_inside_changes_no_momentum_and_its_work_is_in_the_balance():
     assert run.audit().passed
 
 
+def test_first_pulse_of_a_motor_at_rest_passes_the_audit():
+    """The state is zero when the motor starts, so its size there is no scale of the residual of a step."""
+    pulse = lt.PiecewiseConstant([0.7, 1.5], [0.2])
+    system = tree_of(BODIES[:2], NAMES[:2]).system(baths=BATHS, motors={"panel": pulse})
+    run = lt.integrate(system, system.state(), (0.0, 2.0), 0.05, lt.MetriplecticGauss(2))
+    assert not run.x[:15].any()
+    assert np.abs(run.joints["panel"][-1]) > 0.01
+    assert run.stats.worst_residual < 1e-12
+    assert run.audit().passed
+
+
+@pytest.mark.slow
+def test_explicit_steps_of_a_tree_that_is_released_at_rest():
+    """The momentum stays zero, and the joint swings as by Newton and Euler."""
+    system = tree_of(BODIES[:2], NAMES[:2]).system(baths=BATHS)
+    run = lt.integrate(system, system.state(joints={"panel": 0.4}), (0.0, 2.0), 0.05, lt.MetriplecticRungeKutta(6))
+    attitude, joints, _ = final_state(BODIES[:2], (0.0, 0.0, 0.0), [0.4], [0.0], 2.0)
+    assert not run.x[:, :3].any()
+    assert abs(run.joints["panel"][-1] - joints[0]) < 1e-7
+    assert np.abs(run.attitude[-1] - attitude).max() < 1e-7
+    assert run.audit().passed
+
+
 def test_torque_on_the_base_changes_the_momentum_by_its_impulse():
     tree = tree_of(BODIES[:2], NAMES[:2])
     system = tree.system(baths=BATHS, torque=lt.torques.ConstantInSpace((0.1, 0.0, 0.2)))

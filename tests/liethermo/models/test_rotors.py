@@ -89,6 +89,40 @@ def test_a_damper_wheel_brings_the_body_to_its_spin():
     assert float(system.temperatures(run.x[-1])[0]) == pytest.approx(end, rel=1e-11)
 
 
+@pytest.mark.parametrize(
+    ("method", "step"),
+    [
+        (lt.MetriplecticRungeKutta(6), 0.1),
+        (lt.MetriplecticRungeKutta(8), lt.Adaptive(1e-9)),
+        (lt.MetriplecticTaylor(8), 0.1),
+        (lt.MetriplecticGauss(3), 0.1),
+    ],
+    ids=str,
+)
+def test_motors_turn_a_body_from_rest_without_momentum(method, step):
+    """The momentum of the whole is zero all the way, where the gradient of its length vanishes."""
+    inertia, J, k = np.array([[3.0, 0.2, 0.1], [0.2, 2.0, -0.3], [0.1, -0.3, 1.5]]), 0.1, 0.02
+    times, torques = [1.0, 3.0, 5.0], np.array([[0.02, 0.0, 0.01], [-0.02, 0.01, 0.0]])
+    motors = lt.torques.Motor(lt.PiecewiseConstant(times, torques))
+    body = lt.models.reaction_wheels(inertia, wheels=J, friction=k, torque=motors)
+    run = lt.integrate(body, body.state(angular_velocity=np.zeros(3)), (0.0, 7.0), step, method)
+
+    mass = np.block([[inertia, J * np.eye(3)], [J * np.eye(3), J * np.eye(3)]])
+
+    def f(t, s, u):
+        velocity = np.linalg.solve(mass, np.append(np.zeros(3), s[9:]))
+        return np.append((s[:9].reshape(3, 3) @ np.cross(np.eye(3), velocity[:3])).ravel(), u - k * velocity[3:])
+
+    s = np.append(np.eye(3).ravel(), np.zeros(3))
+    for start, end, u in zip([*times], [*times[1:], 7.0], [*torques, np.zeros(3)], strict=True):
+        s = solve_ivp(f, (start, end), s, "DOP853", rtol=1e-12, atol=1e-14, args=(u,)).y[:, -1]
+    assert np.abs(run.attitude[-1] - s[:9].reshape(3, 3)).max() < 1e-9
+    assert np.abs(run.x[-1, 3:6] - s[9:]).max() < 1e-9
+    assert np.abs(run.attitude[-1] - np.eye(3)).max() > 1e-2
+    assert np.abs(run.x[:, :3]).max() < 1e-18
+    assert run.audit().passed
+
+
 def test_dual_spin_against_velocities():
     a, J, k, rates = np.array([0.0, 0.0, 1.0]), 0.3, 0.02, (0.05, 0.03)
     inertia = np.array([1.1, 1.0, 0.6])

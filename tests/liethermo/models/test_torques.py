@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 import liethermo as lt
-from liethermo.engines.compiled.step_loop import CompiledEngine
+from liethermo.engines.compiled.engine import CompiledEngine
 from liethermo.models.orbits import eccentric_anomaly, rotate
 from liethermo.runs.preparation import prepare_system_and_method
 from tests.refusals import refusal_test
@@ -343,6 +343,13 @@ test_bad_torques_are_refused = refusal_test(
     (lambda: T.RayleighDrag(-1.0), ">= 0"),
     (lambda: T.Orbit(1.0, eccentricity=1.0), "below 1"),
     (lambda: T.DipoleField(DIPOLE, np.ones(3)), "function of t"),
+    (lambda: T.DipoleField(DIPOLE, T.Orbit(N)), "radius"),
+    (lambda: T.Orbit(N)(0.0), "radius"),
+    (lambda: T.GravityGradient(INERTIA, T.Orbit(N), eccentricity=0.1, anomaly=0.0), "eccentricity and anomaly"),
+    (lambda: lt.models.free_rigid_body(torque=T.Motor([0.1, 0.0, 0.0])), "each wheel of the body, which has 0"),
+    (lambda: lt.models.reaction_wheels(torque=T.Motor([0.1, 0.0])), "which has 3, but got shape"),
+    (lambda: lt.models.reaction_wheels(torque=T.Motor(lambda t: jnp.ones(4))), "which has 3, but got shape"),
+    (lambda: lt.models.free_rigid_body().state(angular_velocity=np.ones(3), rotor_rates=[1.0]), "with rotors"),
     (lambda: T.SolarPressurePlates([1.0], [[0, 0, 0.0]], [[0, 0, 1.0]]), "must not be zero"),
     (lambda: T.SolarPressurePlates([1.0], [[0, 0, 1.0]], [[0, 0, 1.0]], 0.7, 0.7), "at most 1"),
     (lambda: T.Thrusters(np.zeros((2, 3)), np.zeros((3, 3))), "shape"),
@@ -378,3 +385,22 @@ def test_engines_agree_on_tables(method):
     torque = [T.Tabulated(SPLINE), T.ConstantInSpace([0.0, 0.1, 0.0])]
     ends = [run(torque, False, method=method, engine=engine)[1].x[-1] for engine in ("array", "compiled")]
     assert np.abs(ends[0] - ends[1]).max() < 1e-13
+
+
+def test_torque_of_the_time_alone():
+    """A function of t, a table and pulses are torques as they are; the pulses state their breaks."""
+    start, span, method = [0.3, -0.2, 0.9], (0.0, 3.0), lt.MetriplecticGauss(2)
+    pairs = [
+        (lambda t: jnp.stack([0.0 * t, jnp.sin(t), 0.1 * t]), lambda t, mu: jnp.stack([0.0 * t, jnp.sin(t), 0.1 * t])),
+        (lt.PiecewiseConstant([0.25, 1.1], [(0.0, 0.0, 0.1)]), T.PiecewiseConstant([0.25, 1.1], [(0.0, 0.0, 0.1)])),
+        (T.Table(NODES, MOMENTS, kind="cubic"), T.Tabulated(NODES, MOMENTS, kind="cubic")),
+    ]
+    for of_time, of_momentum in pairs:
+        runs = [
+            lt.integrate(lt.models.free_rigid_body(INERTIA, torque=torque), start, span, 0.1, method)
+            for torque in (of_time, of_momentum)
+        ]
+        np.testing.assert_array_equal(runs[0].t, runs[1].t)
+        np.testing.assert_allclose(runs[0].x, runs[1].x, atol=1e-15)
+        assert runs[0].audit().passed
+        assert np.ptp(runs[0].x @ np.eye(3)[1]) > 1e-3

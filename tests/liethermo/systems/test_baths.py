@@ -104,9 +104,24 @@ def test_power_from_a_bath_stops_the_run():
         lt.integrate(system, system.state(START), (0.0, 4.0), 0.05)
 
 
+def test_the_number_of_baths_is_that_of_their_entries():
+    hot_and_cold = [2.0, 0.5]
+    y = np.array([0.3, -0.2])
+    for implied, given in [
+        (lt.HeatBaths(3.0, hot_and_cold), lt.HeatBaths(3.0, hot_and_cold, number=2)),
+        (lt.HeatBaths(np.array([1.0, 2.0])), lt.HeatBaths([1.0, 2.0], number=2)),
+        (lt.HeatBaths(energy=[None, lambda y: y + y**2]), lt.HeatBaths(energy=[None, lambda y: y + y**2], number=2)),
+    ]:
+        assert implied.number == 2
+        assert implied.energy.value(y) == given.energy.value(y)
+    assert lt.HeatBaths(3.0, 2.0).number == lt.HeatBaths().number == 1
+
+
 BAD = {
     "a finite capacity": (lambda: lt.HeatBaths(2.0, lambda t: 1.0 + t), "must be infinite"),
     "a vector of temperatures": (lambda: lt.HeatBaths(np.inf, lambda t: jnp.ones(2)), "must have shape"),
+    "lists of different lengths": (lambda: lt.HeatBaths([1.0, 2.0], [1.0, 2.0, 3.0]), "of 3 baths"),
+    "no temperatures": (lambda: lt.HeatBaths(1.0, []), "positive integer, not 0"),
     "too few temperatures": (lambda: lt.HeatBaths(1.0, [1.0], number=2), "entry for each"),
     "power without baths": (
         lambda: lt.SpinSystem(1, lt.magnetism.zeeman(1, (0, 0, 1.0)), power=lambda t: t),

@@ -194,7 +194,7 @@ def test_a_state_of_a_quartic_energy_is_found_by_newtons_method():
         ({"x": [1.0, 0, 0], "angular_velocity": [1.0, 0, 0]}, "got both"),
         ({"angular_velocity": [1.0, 0]}, "shape"),
         ({"angular_velocity": [1.0, 0, np.inf]}, "finite"),
-        ({"angular_velocity": [1.0, 0, 0], "rotor_rates": [1.0]}, "one for each rotor"),
+        ({"angular_velocity": [1.0, 0, 0], "rotor_rates": [1.0]}, "a body with rotors"),
         ({"angular_velocity": [1.0, 0, 0], "temperature": -1.0}, "positive"),
         ({"x": [1.0, 0, 0], "temperature": 1.0}, "needs x"),
     ],
@@ -253,3 +253,10 @@ def test_rotor_rates_of_a_driven_body_and_of_an_ensemble(tmp_path):
     assert solution.to_xarray(units={"time": "s"})["rotor_rates"].attrs["units"] == "rad/s"
     many = lt.ensemble(body, np.stack([x0, x0]), (0.0, 2.0), 0.1)
     assert np.allclose(lt.bodies.rotor_rates(many)[:, 0], rates[-1], atol=1e-12)
+
+
+@pytest.mark.parametrize("attitude", [[0.0, 0.0, 0.0, 1.0], [0.1, 0.2, 0.3], np.eye(3)[0], np.ones((5, 4))])
+def test_a_run_refers_quaternions_and_angles_to_the_function_that_converts_them(attitude):
+    body = lt.models.free_rigid_body(attitude=True)
+    with pytest.raises(lt.InputError, match=r"lt\.bodies\.attitude\(quaternion=\.\.\.\)"):
+        lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 1.0), 0.1, attitude=attitude)

@@ -76,6 +76,17 @@ def test_group_from_equations(f, text, catalogue):
         np.testing.assert_allclose(catalogue.log(g), catalogue.algebra.vee(G.algebra.hat(x)), atol=1e-12)
 
 
+def test_equations_may_be_a_list():
+    """Orthogonal matrices that keep the third axis turn about it."""
+    axis = jnp.array([0.0, 0.0, 1.0])
+    G = mf.MatrixGroup.from_equations(lambda A: [orthogonal(A), A @ axis - axis], 3, name="turns")
+    assert G.dim == 1
+    g = np.asarray(G.exp(np.array([0.3])))
+    assert bool(G.belongs(g))
+    np.testing.assert_allclose(np.abs(g[0, 1]), np.sin(0.3 * np.abs(G.algebra.basis).max()), atol=1e-14)
+    assert not bool(G.belongs(mf.SO(3).exp(np.array([0.3, 0.0, 0.0]))))
+
+
 def test_group_from_equations_is_the_attitude_of_a_run():
     G = mf.MatrixGroup.from_equations(orthogonal, 3)
     basis = np.asarray(mf.so(3).vee(G.algebra.basis))  # rows: the elements of the new basis in so(3)
