@@ -18,7 +18,7 @@ from manifolds._pytree_module import Module
 from ..errors import InputError
 from ..functions.energy import Energy, Pullback, Sum
 from ..systems.base import System
-from ..systems.interface import EngineHints
+from ..systems.interface import EngineHints, MotionQuantities
 from ..tracing.programs import jit_unoptimised
 from .articulated_bodies import ArticulatedBodies, JointDamping, JointSprings, KineticEnergy, Motion
 from .parameters import checked_finite
@@ -111,11 +111,13 @@ class TreeSystem(System):
         return {name: _entries(rates, start - first, end - first) for name, start, end in self.joint_ranges}
 
     @property
-    def velocity_functions(self):
+    def motion_quantities(self) -> MotionQuantities:
+        quantities = super().motion_quantities
         if not self.joint_ranges:
-            return super().velocity_functions
+            return quantities
         start, k = self.joint_ranges[0][1] + self.mechanism.n_joints, self.mechanism.n_joints
-        return super().velocity_functions | {"joint_rates": lambda x: self.energy.gradient(x)[start : start + k]}
+        velocities = {**quantities.velocities, "joint_rates": lambda x: self.energy.gradient(x)[start : start + k]}
+        return quantities._replace(velocities=velocities, joint_ranges=self.joint_ranges)
 
     @with_library_settings
     def _motion(self, x) -> Motion:

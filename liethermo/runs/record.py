@@ -229,7 +229,7 @@ class EnsembleRecord:
         """Return functions that compute the velocities of all trajectories, by the names of the velocities."""
         if self.x is None and self.trajectories is None:
             return {}
-        return {name: functools.partial(self._velocities, name) for name in self.member.velocity_functions}
+        return {name: functools.partial(self._velocities, name) for name in self.member.motion_quantities.velocities}
 
     def _velocities(self, name: str) -> np.ndarray:
         parts = [group.velocities(name) for group in self.groups]

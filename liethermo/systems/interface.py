@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
@@ -52,6 +53,25 @@ class OrbitLevels(NamedTuple):
     n_momenta: int
     casimirs: frozenset[str]
     has_all_casimirs: bool = False
+
+
+class MotionQuantities(NamedTuple):
+    """Velocities and joints of rigid bodies in a system, for its solutions.
+
+    Attributes
+    ----------
+    velocities : mapping from names to functions of a state, shape (n,), to an array, shape (k,)
+        The names are ``angular_velocity`` of a rigid body, in body axes, ``rotor_rates`` of its rotors relative to it,
+        and ``joint_rates``. Joint rates have the order of ``joint_ranges``.
+    joint_ranges : tuple of (str, int, int)
+        Names of bodies with a joint, and the first and the last but one index of its coordinates in a state.
+    momentum_scale : function from a state, shape (n,), to a number, shape ()
+        Returns the size of terms that cancel in the momentum; zero if there are none.
+    """
+
+    velocities: Mapping[str, Callable] = MappingProxyType({})
+    joint_ranges: tuple[tuple[str, int, int], ...] = ()
+    momentum_scale: Callable[[Any], jax.Array] = lambda x: jnp.zeros(())
 
 
 class SparseNewton(NamedTuple):
@@ -155,23 +175,10 @@ class SystemInterface(Geometry):
         """
         return None
 
-    def momentum_scale(self, x) -> jax.Array:
-        """Return the size of terms that cancel in the momentum at x, shape (); zero if there are none."""
-        return jnp.zeros(())
-
     @property
-    def joint_ranges(self) -> tuple[tuple[str, int, int], ...]:
-        """Names of bodies with a joint, and the first and the last but one index of its coordinates in a state."""
-        return ()
-
-    @property
-    def velocity_functions(self) -> dict[str, Callable]:
-        """Functions of a state, shape (n,), to velocities that a solution shows, shape (k,), by name.
-
-        They are ``angular_velocity`` of a rigid body, in body axes, ``rotor_rates`` of its rotors relative to it, and
-        ``joint_rates`` in the order of :attr:`joint_ranges`.
-        """
-        return {}
+    def motion_quantities(self) -> MotionQuantities:
+        """Velocities and joints of rigid bodies in the system; empty for other systems."""
+        return MotionQuantities()
 
     @property
     def inner(self) -> SystemInterface | None:

@@ -21,7 +21,7 @@ from ..tracing.caching import memoize
 from ..tracing.interpret import evaluate_at_points
 from .baths import BathEntropy, HeatBaths
 from .body_states import checked_velocity, entropies_of_temperatures, is_given_by_velocity, momentum_of_velocity
-from .interface import TORQUE_FREE_LAWS, OrbitLevels, TorqueLaws
+from .interface import TORQUE_FREE_LAWS, MotionQuantities, OrbitLevels, TorqueLaws
 from .torque import (
     MAX_ARGUMENTS,
     MAX_ARGUMENTS_WITHOUT_ATTITUDE,
@@ -162,9 +162,11 @@ class LiePoissonSystem(TorqueSystem):
         return _inertia_tensor(energy, self.algebra.dim) if energy.is_quadratic else None
 
     @property
-    def velocity_functions(self):
+    def motion_quantities(self) -> MotionQuantities:
         parts = body_velocity_slices(self.algebra)
-        return {name: lambda x, part=part: self.energy.gradient(x)[part] for name, part in parts.items()}
+        return MotionQuantities(
+            {name: lambda x, part=part: self.energy.gradient(x)[part] for name, part in parts.items()}
+        )
 
     def state(
         self, x=None, batch: bool = False, *, angular_velocity=None, rotor_rates=None, temperature=None, t=None

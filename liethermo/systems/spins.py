@@ -18,6 +18,7 @@ from manifolds.structures.poisson import ProductPoisson
 from manifolds.structures.spins import add_vectors, cross, cross_vectors, dot_vectors, scale_vectors, split_vectors
 
 from ..dissipation.base import Dissipation
+from ..dissipation.geometry import HeatingSites
 from ..dissipation.heating import BathConduction, Heating
 from ..dissipation.landau_lifshitz import LandauLifshitz
 from ..errors import InputError
@@ -120,8 +121,9 @@ class SpinSystem(TorqueSystem):
         return flatten_site_functions(energy, (*self.lattice, 3))
 
     @property
-    def heating_sites(self) -> tuple[int, ...]:
-        return self.lattice
+    def heating_sites(self) -> HeatingSites:
+        assert self._spin_structure is not None
+        return _HeatingSpins(self.lattice, self._spin_structure)
 
     def _field_without_torque(self, x, dH, dS, dL):
         # precession and damping of the spins are added before they are stored in a state
@@ -169,21 +171,6 @@ class SpinSystem(TorqueSystem):
 
     def drop_baths(self):
         return _drop_power(super().drop_baths())
-
-    def scale_at_sites(self, values, v) -> jax.Array:
-        """Return a vector v multiplied by ``values``, one for each site or one for all."""
-        spins = self._spin_structure
-        assert spins is not None
-        return (
-            spins.join_state(scale_vectors(values, spins.split_covectors(v)), jnp.zeros(0))
-            if jnp.ndim(values)
-            else values * v
-        )
-
-    def dot_at_sites(self, alpha, v) -> jax.Array:
-        spins = self._spin_structure
-        assert spins is not None
-        return dot_vectors(spins.split_covectors(alpha), spins.split_covectors(v))
 
     def solve_at_spins(self, x, dH, noise_rates, half_step, velocities) -> jax.Array | None:
         """Return u with ``u_i - half_step J_i u_i = v_i`` at each spin and u = v elsewhere, v the sum of velocities.
@@ -275,6 +262,20 @@ class SpinSystem(TorqueSystem):
         """Poisson structure of the spins; None if the system runs in other coordinates."""
         poisson = self.poisson.first if isinstance(self.poisson, ProductPoisson) else self.poisson
         return poisson if isinstance(poisson, mf.Spins) else None
+
+
+class _HeatingSpins(HeatingSites):
+    """Sites with a spin each, in the order of components of a Poisson structure."""
+
+    def __init__(self, shape: tuple[int, ...], spins: mf.Spins):
+        super().__init__(shape)
+        self._spins = spins
+
+    def _scale_each(self, values, v) -> jax.Array:
+        return self._spins.join_state(scale_vectors(values, self._spins.split_covectors(v)), jnp.zeros(0))
+
+    def dot(self, alpha, v) -> jax.Array:
+        return dot_vectors(self._spins.split_covectors(alpha), self._spins.split_covectors(v))
 
 
 class ReorderedSystem(NamedTuple):
