@@ -31,7 +31,7 @@ COMPARED_STEPS = 300
 def library_run(
     system: lt.System, steps: int, engine: Engine, save_every: int | None = None
 ) -> Callable[[], lt.Solution]:
-    """Return a run of the library from :data:`.problems.X0`, which saves only the final state by default."""
+    """Return a run of the library from :data:`.suites.X0`, which saves only the final state by default."""
     span, midpoint = (0.0, STEP_SIZE * steps), lt.MetriplecticMidpoint()
     return functools.partial(
         lt.integrate, system, X0, span, STEP_SIZE, midpoint, save_every=save_every or steps, engine=engine
@@ -41,7 +41,7 @@ def library_run(
 def c_run(
     program: BodyProgram, steps: int, save_every: int | None = None
 ) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
-    """Return a run of a C program from :data:`.problems.X0`, with the arguments of :func:`library_run`."""
+    """Return a run of a C program from :data:`.suites.X0`, with the arguments of :func:`library_run`."""
     return functools.partial(program.integrate, X0, STEP_SIZE, steps, save_every)
 
 

@@ -27,7 +27,7 @@ def exact_state(x0, rate: float, t_end: float) -> np.ndarray:
 
 
 def _taylor_coefficients(x0: list[Decimal], rate: Decimal) -> list[list[Decimal]]:
-    """Return the Taylor coefficients of the three components, by the recursion of :func:`.problems.body_field`."""
+    """Return the Taylor coefficients of the three components, by the recursion of :func:`.suites.body_field`."""
     inverse = [1 / Decimal(moment) for moment in INERTIA]
     x: list[list[Decimal]] = [[a] for a in x0]
     w: list[list[Decimal]] = [[], [], []]

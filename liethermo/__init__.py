@@ -10,7 +10,7 @@ import importlib.metadata
 import warnings
 
 import manifolds  # noqa: F401  (switches 64-bit mode on before anything is traced)
-from manifolds._names import public_dir
+from manifolds._arguments import public_dir
 
 from . import (
     _class_members,  # noqa: F401  (what help() lists of the classes)
@@ -20,19 +20,14 @@ from . import (
 )
 from .dissipation.adiabatic import AdiabaticJumps
 from .dissipation.base import Dissipation
-from .dissipation.bath_conduction import BathConduction
-from .dissipation.double_bracket import DoubleBracket
+from .dissipation.brackets import DoubleBracket, FourBracket, InnerProductDissipation, KillingDissipation
 from .dissipation.factor import Factor
-from .dissipation.force import EulerPoincareForce
-from .dissipation.four_bracket import FourBracket
-from .dissipation.friction import Friction
-from .dissipation.friction_operator import FrictionOperator
-from .dissipation.inner_product import InnerProductDissipation, KillingDissipation
+from .dissipation.friction import EulerPoincareForce, Friction, FrictionOperator
+from .dissipation.heating import BathConduction
 from .dissipation.landau_lifshitz import LandauLifshitz
 from .dissipation.lindblad import LindbladJumps
-from .dissipation.local_metric import LocalProjectedMetric
 from .dissipation.potential import ActivatedFriction, CoulombFriction, DissipationPotential, PowerLawFriction
-from .dissipation.projected_metric import ProjectedMetric
+from .dissipation.projected_metric import LocalProjectedMetric, ProjectedMetric
 from .dissipation.quantum import ThermalJumps
 from .dissipation.steepest_ascent import SteepestEntropyAscent
 from .errors import (
@@ -51,11 +46,10 @@ from .errors import (
 )
 from .functions import magnetism
 from .functions.density import VonNeumann
-from .functions.each import Each
 from .functions.energy import Energy, Function, Quadratic, TimeDependent
 from .functions.gradients import CoordinateIncrement, DiscreteGradient, Gonzalez, MeanValue
-from .functions.mechanics import Kinetic, Potential
-from .functions.piecewise import PiecewiseConstant
+from .functions.mechanics import Each, Kinetic, Potential
+from .functions.time_span import PiecewiseConstant
 from .integrators import (
     DiscreteHerglotz,
     FiniteDifference,
@@ -74,7 +68,7 @@ from .integrators import (
 from .models import torques
 from .results.audit import Audit
 from .results.ensemble import Ensemble
-from .results.load import load
+from .results.files import load
 from .results.solution import Solution
 from .results.status import Stats, Status
 from .runs.adaptive import Adaptive

@@ -6,7 +6,7 @@ axes to axes in space [:doc:`/reference/conventions`].
 
 from __future__ import annotations
 
-from manifolds._names import public_dir
+from manifolds._arguments import public_dir
 
 from .models.bodies_on_ground import BodiesOnGround
 from .models.free_motion import Periods, damping_time, periods, rate_of
@@ -14,7 +14,7 @@ from .models.inertia import PrincipalAxes, principal_axes
 from .models.jointed_bodies import JointedBodies
 from .models.joints import Hinge, Slider, Universal
 from .models.tree import Tree
-from .results.attitude_files import AttitudeHistory, read_csv, write_csv
+from .results.files import AttitudeHistory, read_csv, write_csv
 from .results.orientation import (
     angular_momentum,
     angular_velocity,

@@ -21,7 +21,7 @@ from .errors import AxiomError, FileError, InputError, LiethermoError
 from .integrators import registered_methods
 from .results.audit import Audit
 from .results.ensemble import Ensemble
-from .results.load import load
+from .results.files import load
 from .results.solution import Solution
 from .runs.integrate import integrate
 from .studies.store_results import load_status, load_study
@@ -138,7 +138,7 @@ def study(
 ) -> None:
     """Run the unfinished points of a study, audit the laws, and draw a measure."""
     from .spec import read
-    from .spec.study import build_study
+    from .spec.reading import build_study
 
     plan = read(spec, change or (), allow or ())
     store = Path(f"{spec.stem}.zarr") if out is None else out
@@ -179,7 +179,7 @@ def check(spec: SpecFile, change: SetOptions = None, allow: AllowedModules = Non
 
     plan = read(spec, change or (), allow or (), lambda what: typer.echo(f"{spec}: {what}"))
     if plan.study is not None:
-        from .spec.study import build_study
+        from .spec.reading import build_study
 
         build_study(plan, "unused.zarr")
     report = plan.build_system().check()

@@ -7,20 +7,16 @@ round them away.
 import importlib
 
 from . import _fork_guard, _precision, testing  # noqa: F401
-from ._names import public_dir
-from .algebras.blocks import DirectSum, power
-from .algebras.casimirs import NoPolynomialCasimirWarning
+from ._arguments import public_dir
+from .algebras.blocks import DirectSum, direct_sum, power, semidirect_sum
+from .algebras.casimirs import NoPolynomialCasimirWarning, TracePolynomial
 from .algebras.catalogue import abelian, aff, bianchi, g2, galilei, gl, heisenberg, registered, se, sl, so, sp, su, u
-from .algebras.formula import Formula
-from .algebras.invariants import TracePolynomial
 from .algebras.isomorphism_type import IsomorphismType
-from .algebras.killing import trilinear_form
-from .algebras.lie_algebra import LieAlgebra
+from .algebras.lie_algebra import LieAlgebra, trilinear_form
 from .algebras.magnetic import MagneticExtension, magnetic_extension
 from .algebras.matrix_algebra import MatrixAlgebra, MatrixTrace
 from .algebras.patera import patera
-from .algebras.polynomial import Polynomial
-from .algebras.sums import direct_sum, semidirect_sum
+from .algebras.polynomial import Formula, Polynomial
 from .errors import (
     AntisymmetryError,
     ClosureError,
@@ -40,20 +36,20 @@ from .errors import (
 )
 from .groups.catalogue import GL, SE, SL, SO, SU, Heisenberg, Sp
 from .groups.matrix_group import MatrixGroup, registered_groups
-from .matrices.divided_differences import ScalarFunction
-from .matrices.spectral import spectral, spectral_difference, spectral_trace
+from .matrices.spectral import ScalarFunction, spectral, spectral_difference, spectral_trace
 from .retractions.charts import (
     CayleyRetraction,
     EuclideanRetraction,
     GroupRetraction,
     MidpointRetraction,
+    PolarRetraction,
     ProjectionRetraction,
+    QRRetraction,
     RiemannianRetraction,
+    StiefelCayleyRetraction,
     retraction,
 )
-from .retractions.coordinates import Coordinates, Place, coordinates_around
-from .retractions.retraction import Chart, Retraction
-from .retractions.stiefel_charts import PolarRetraction, QRRetraction, StiefelCayleyRetraction
+from .retractions.retraction import Chart, Coordinates, Place, Retraction, coordinates_around
 from .spaces import (
     SPD,
     Correlation,
@@ -86,9 +82,16 @@ from .structures.contact import (
     LagrangianContact,
     SplitContact,
 )
-from .structures.density import DensityMatrices
-from .structures.extended import ExtendedPhaseSpace
-from .structures.poisson import Canonical, LiePoisson, NoPoisson, PoissonMap, PoissonStructure, PoissonTensor
+from .structures.poisson import (
+    Canonical,
+    DensityMatrices,
+    ExtendedPhaseSpace,
+    LiePoisson,
+    NoPoisson,
+    PoissonMap,
+    PoissonStructure,
+    PoissonTensor,
+)
 from .structures.spins import Spins
 
 __all__ = [

@@ -98,3 +98,13 @@ def stack_columns(columns: Sequence[jax.Array]) -> jax.Array:
     for i, column in enumerate(leading_columns):
         stacked_columns = jnp.where(np.arange(len(columns)) == i, column, stacked_columns)
     return stacked_columns
+
+
+def first_nonfinite_index(result, n_core_axes: int) -> tuple[int, ...] | None:
+    """Return the batch index of the first result that is not finite, or None; None while tracing.
+
+    The last ``n_core_axes`` axes of the result hold one element.
+    """
+    if is_traced(result):
+        return None
+    return first_true_index(~np.isfinite(np.asarray(result)).all(axis=tuple(range(-n_core_axes, 0))))

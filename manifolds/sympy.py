@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 import sympy
 
-from ._names import component_names, public_dir
-from .algebras.formula import Formula
+from ._arguments import component_names, public_dir
 from .algebras.lie_algebra import LieAlgebra
-from .algebras.polynomial import Polynomial
+from .algebras.polynomial import Formula, Polynomial
 from .errors import ComponentError, ShapeError
 
 __all__ = ["algebra", "expression", "polynomial", "structure_constants", "symbols"]

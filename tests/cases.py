@@ -29,6 +29,11 @@ TOLERANCES = {
 }
 
 
+def max_abs(a) -> float:
+    """Return the largest absolute value of an array, 0 if it is empty."""
+    return float(np.abs(np.asarray(a)).max(initial=0.0))
+
+
 def tolerance(name: str) -> float:
     return TOLERANCES[name][0]
 
@@ -259,3 +264,12 @@ def combinations(algebras) -> list:
         for case in DISSIPATIONS
         if case.exempt(g) is None
     ]
+
+
+def rows(audit, law):
+    return [row for row in audit.rows if row.law.startswith(law)]
+
+
+def only_row(audit, law):
+    (row,) = rows(audit, law)
+    return row

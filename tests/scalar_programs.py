@@ -103,3 +103,7 @@ def check_agrees_with_jax(f, *args, **options) -> Program:
     program = program_of(f, *args)
     check_outputs(program, args, jax_values(f, *args), **options)
     return program
+
+
+def real_and_imaginary(z):
+    return [jnp.real(z), jnp.imag(z)]

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import liethermo as lt
 from liethermo.cli import app
-from liethermo.engines.compiled.step_loop import CompiledTrajectory
+from liethermo.engines.compiled.engine import CompiledTrajectory
 from liethermo.integrators import METHODS
 from liethermo.spec import FIGURES
 

@@ -12,7 +12,7 @@ import pytest
 
 import liethermo as lt
 from liethermo.spec import read
-from liethermo.spec.study import build_study
+from liethermo.spec.reading import build_study
 from liethermo.studies.store_results import audit_store, load_status, load_study
 from tests.liethermo.results.test_netcdf import rewrite
 

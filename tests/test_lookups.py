@@ -41,13 +41,7 @@ FOREIGN = {
 
 OURS = {
     ("liethermo/learn/files.py", "training"): "what a fit has put beside a system",
-    (
-        "liethermo/testing/transformations.py",
-        "rate",
-    ): "of any dissipation that a case has; another way is taken without it",
     ("liethermo/functions/on_spaces.py", "dim"): "of a Casimir, which may be any function that knows its dimension",
-    ("liethermo/dissipation/operators.py", "structure"): "refused, with a message, where there is none",
-    ("manifolds/algebras/killing.py", "killing_form"): "refused, with a message, where there is none",
 }
 
 

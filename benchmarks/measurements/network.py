@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse
 
 import liethermo as lt
-from liethermo.models.heat_grid import grid_adjacency_matrix
+from liethermo.models.thermo_particles import grid_adjacency_matrix
 
 from .. import child as process
 from .. import laws

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 import liethermo as lt
-from liethermo.models.mass_spring_gas import CASES
+from liethermo.models.gases import CASES
 
 from ..contest import race_one_trajectory, require_same_scheme
 from ..native import BodyProgram

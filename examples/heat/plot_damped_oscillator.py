@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import liethermo as lt
-from liethermo.models.oscillator import damped_oscillator_solution
+from liethermo.models.springs import damped_oscillator_solution
 
 oscillator = lt.models.damped_oscillator(friction=0.1)
 print(oscillator.check())

@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import liethermo as lt
-from liethermo.models.cylinder import cylinder_rest
+from liethermo.models.gases import cylinder_rest
 
 pressure, heat_capacity = (
     1.0e5,

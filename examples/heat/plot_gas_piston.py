@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import liethermo as lt
-from liethermo.models.gas_piston import gas_piston_equilibrium, gas_piston_state
+from liethermo.models.gases import gas_piston_equilibrium, gas_piston_state
 
 moles = (1.0, 2.0)
 piston = lt.models.gas_piston(moles, mass=2.0, conductance=(5.0, 5.0), friction=40.0)

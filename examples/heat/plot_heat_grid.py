@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import liethermo as lt
-from liethermo.models.heat_grid import heat_grid_solution
+from liethermo.models.thermo_particles import heat_grid_solution
 
 shape = (60, 60)
 grid = lt.models.heat_grid(shape, capacity=1.0, conductance=1.0)

@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import liethermo as lt
-from liethermo.models.gas_piston import GAS_CONSTANT, gas_piston_state
+from liethermo.models.gases import GAS_CONSTANT, gas_piston_state
 
 moles, k = (1.0, 2.0), 1e-3
 system = lt.models.gas_piston(moles=moles, conductance=(100.0, 100.0))

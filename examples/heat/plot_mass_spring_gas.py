@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import liethermo as lt
-from liethermo.models.mass_spring_gas import CASES, STARTS, mass_spring_gas_solution
+from liethermo.models.gases import CASES, STARTS, mass_spring_gas_solution
 
 h, steps = 1e-3, 100_000
 frictions = (0.0, 0.2, 5.0, 10.0)

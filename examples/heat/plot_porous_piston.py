@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import liethermo as lt
-from liethermo.models.open_gases import porous_piston_state
+from liethermo.models.gases import porous_piston_state
 
 x0 = porous_piston_state(
     left=(2.0, 1.4), right=(1.0, 0.8)

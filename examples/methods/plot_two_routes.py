@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import liethermo as lt
-from liethermo.models.gas_piston import gas_piston_state
+from liethermo.models.gases import gas_piston_state
 
 piston = lt.models.gas_piston(friction=5.0, conductance=(2.0, 2.0))
 x0, end = gas_piston_state(0.35, (300.0, 320.0, 290.0)), 0.1

@@ -16,9 +16,9 @@ from manifolds.matrices.linear import adjoint
 from manifolds.matrices.spectral import ordered_eigenvectors
 
 from ..errors import InputError
+from ..functions.bath_energy import BodyBathsEnergy
 from ..functions.density import matrix_logarithm
 from ..functions.indices import Indices
-from ..functions.with_baths import BodyBathsEnergy
 from .operators import ENERGY_RTOL, commutator, is_hermitian, level_gap_rounding, subtract_common_energy
 from .quantum import ThermalJumps, cluster_labels, friction_image
 

@@ -255,13 +255,15 @@ class DissipationSum(Dissipation):
         return DissipationSum(tuple(part.bind_to(system) for part in self.parts))
 
     def force(self, system, x, dH, dS, dL):
+        if not self.parts:
+            return jnp.zeros_like(x)
         return sum(
             term.force(system, x, dH, dS, dL_part) for term, dL_part in terms_with_preserved_values(self.parts, dL)
         )
 
     @property
     def has_generator(self) -> bool:
-        return all(part.has_generator for part in self.parts)
+        return bool(self.parts) and all(part.has_generator for part in self.parts)
 
     def generator_field(self, system, x, dH):
         return sum(part.generator_field(system, x, dH) for part in self.parts)
@@ -270,6 +272,10 @@ class DissipationSum(Dissipation):
         factors = [term.factor(system, x, dH, dL_part) for term, dL_part in terms_with_preserved_values(self.parts, dL)]
         known_factors = [B for B in factors if B is not None]
         return concatenate_factors(known_factors) if len(known_factors) == len(factors) else None
+
+
+ABSENT_DISSIPATION = DissipationSum(())
+"""Dissipation of a system that has none: energy and entropy are conserved, and the force is zero."""
 
 
 def nondecreasing_if(is_known: bool) -> LawName | None:
@@ -298,6 +304,17 @@ def sum_dissipations(dissipations: Dissipation | Sequence[Dissipation] | None) -
         if not isinstance(term, Dissipation):
             raise InputError(f"dissipation[{i}] must be a Dissipation of this library, got {type(term).__name__}")
     return functools.reduce(operator.add, dissipations)
+
+
+def dissipation_terms(dissipations: Dissipation | Sequence[Dissipation] | None) -> tuple[Dissipation, ...]:
+    """Return the summands of the ``dissipation`` argument of a system: see :func:`sum_dissipations`."""
+    total = sum_dissipations(dissipations)
+    return () if total is None else total.terms
+
+
+def dissipation_name(dissipation: Dissipation | None) -> str | None:
+    """Return the name of the class of a dissipation, for provenances; None without a dissipation."""
+    return None if dissipation is None else type(dissipation).__name__
 
 
 def terms_with_preserved_values(

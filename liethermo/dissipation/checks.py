@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
-from manifolds.matrices.blocks import BlockDiagonal, Diagonal
+from manifolds.matrices.linear import BlockDiagonal, Diagonal
 
 from ..errors import IndefiniteError, InputError
 from ..functions.checks import traced_function_and_shape

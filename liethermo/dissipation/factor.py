@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds.matrices.blocks import BlockDiagonal, Diagonal
+from manifolds.matrices.linear import BlockDiagonal, Diagonal
 from manifolds.matrices.symmetric import semidefinite_factor
 
 from ..functions.frames import sqrt_or_zero

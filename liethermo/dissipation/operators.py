@@ -8,11 +8,13 @@ import numpy as np
 
 import manifolds as mf
 from manifolds.matrices.linear import adjoint
+from manifolds.structures.poisson import ProductPoisson
 
 from ..errors import InputError
 from ..functions.density import choose_reference_level
 from ..functions.gradients import EPS
 from ..functions.indices import StaticArray
+from .geometry import Geometry
 
 ENERGY_RTOL = 8.0 * EPS
 """Error of an energy, relative to the largest one; times the number of levels if energies are eigenvalues."""
@@ -31,9 +33,9 @@ class Operator(StaticArray):
     dtype = complex
 
 
-def get_density_structure(system, name: str) -> mf.DensityMatrices:
+def get_density_structure(system: Geometry, name: str) -> mf.DensityMatrices:
     """Return the structure of a system of density matrices; InputError for other systems."""
-    structure = getattr(system, "structure", None)
+    structure = system.poisson.first if isinstance(system.poisson, ProductPoisson) else system.poisson
     if not isinstance(structure, mf.DensityMatrices):
         raise InputError(f"{name} needs density matrices. Use it in an lt.QuantumSystem")
     return structure

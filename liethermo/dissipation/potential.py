@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from manifolds._pytree_module import Module, forward_to
-from manifolds.matrices.stumpff import hyperbolic_stumpff
+from manifolds.matrices.exponential import hyperbolic_stumpff
 
 from ..errors import FunctionError, InputError
-from ..functions.arguments import required_argument_count
 from ..functions.conditions import checked_numbers
+from ..functions.time_span import required_argument_count
 from ..tracing.index_check import checked_result_shapes
 from .base import Dissipation
 from .checks import state_shape_dtype

@@ -19,11 +19,10 @@ from manifolds.matrices.linear import adjoint
 from manifolds.matrices.spectral import log_mean
 
 from ..errors import InputError
-from ..functions.arguments import required_argument_count
-from ..functions.bath_energy import BathEnergy, ReservoirEnergy
+from ..functions.bath_energy import BathEnergy, BodyBathsEnergy, ReservoirEnergy
 from ..functions.density import matrix_logarithm
 from ..functions.gradients import EPS
-from ..functions.with_baths import BodyBathsEnergy
+from ..functions.time_span import required_argument_count
 from .base import Dissipation
 from .checks import checked_rate
 from .operators import (

@@ -14,21 +14,23 @@ from ..integrators import OneStepMethod
 from ..systems import System
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.programs import jit_cached
-from .array_engine import LazyNewton
-from .compiled.lanes import CompiledAdaptiveRuns
-from .compiled.parameters import ProgramStructure
-from .growth_rate import DENSE_JACOBIAN_DIM
-from .solver_options import DEFAULT_OPTIONS, EPS
-from .status_codes import StatusCode
-from .step import State
-from .step_control import (
+from .adaptive_steps import (
     ATTEMPT_FIELDS,
-    AdaptiveState,
-    StepControl,
     advance_adaptive,
     advance_adaptive_with,
     initial_adaptive_state,
     initial_adaptive_state_program,
+)
+from .array_engine import LazyNewton
+from .compiled.engine import CompiledAdaptiveRuns
+from .compiled.parameters import ProgramStructure
+from .solver_options import DEFAULT_OPTIONS, EPS
+from .status_codes import StatusCode
+from .step import State
+from .step_control import (
+    DENSE_JACOBIAN_DIM,
+    AdaptiveState,
+    StepControl,
     largest_growth_rate_by_arnoldi,
     max_growth_rates,
     max_step_times_growth_rate_for_accuracy,
@@ -44,7 +46,7 @@ class ArrayAdaptiveRuns:
     adaptive_state : AdaptiveState
         State of one trajectory, or of several along a leading axis.
     advance : function of (adaptive_state, max_attempts, with_newton) to an AdaptiveState
-        See :func:`.step_control.advance_adaptive`.
+        See :func:`.adaptive_steps.advance_adaptive`.
     is_single : bool
         Whether there is only one trajectory, without the leading axis.
     """

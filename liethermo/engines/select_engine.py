@@ -17,9 +17,8 @@ from ..systems import System
 from ..tracing.scalarize import UnsupportedPrimitive
 from .adaptive_runs import AdaptiveRuns, ArrayAdaptiveRuns, resume_on_array_engine, start_adaptive_run
 from .array_engine import ArrayEngine, EngineTrajectory
-from .compiled.lanes import CompiledAdaptiveRuns
-from .compiled.step_loop import CompiledEngine, CompiledTrajectory
-from .sparse.engine import SparseEngine
+from .compiled.engine import CompiledAdaptiveRuns, CompiledEngine, CompiledTrajectory
+from .sparse_engine import SparseEngine
 from .step import SavedStates, State
 from .step_control import StepControl
 
@@ -161,7 +160,7 @@ class EngineWithFallback:
         return None if self.noise is None else self.noise(int(state.step), steps, h)
 
     def start_adaptive(self, control: StepControl, x, t: float, stop_time: float, span_length: float) -> AdaptiveRuns:
-        """Start an adaptive run at x at time t; see :func:`.step_control.initial_adaptive_state`."""
+        """Start an adaptive run at x at time t; see :func:`.adaptive_steps.initial_adaptive_state`."""
         self._choose_engine(lambda compiled: compiled.adaptive_step_loop(control)[0].n_operations)
 
         def start_on_engine(engine: Engine, _) -> AdaptiveRuns:
@@ -197,7 +196,7 @@ class EngineWithFallback:
         if self.requested_engine == "sparse" or (
             is_auto and system.dim >= MIN_SPARSE_DIM and not method.explicit and self.noise is None
         ):
-            if system.sparsity_pattern() is not None:
+            if system.sparse_newton.find_pattern() is not None:
                 return SparseEngine(system, method)
             if not is_auto:
                 raise InputError(

@@ -25,20 +25,22 @@ from manifolds._pytree_module import Module, forward_to
 from ..errors import FunctionError, InputError
 from ..tracing.programs import subprogram
 from ..tracing.short_form import short_form
-from .arguments import (
+from .conditions import checked_numbers
+from .indices import ComponentMap, Components, check_coordinates, clique_pattern, sparsity_pattern, union_pattern
+from .path import CollocationPath, DiscreteGradientScheme
+from .rounding import value_and_rounding_scale
+from .time_span import (
     CoordinatesWithTime,
+    DeclaredTimes,
     FixedTimeFunction,
+    FunctionWithBreaks,
     MultipleFunction,
     NegatedFunction,
     StateTimeFunction,
+    TimeSpan,
+    checked_breaks,
     required_argument_count,
 )
-from .conditions import checked_numbers
-from .coordinates import ComponentMap, Components, check_coordinates
-from .indices import clique_pattern, sparsity_pattern, union_pattern
-from .path import CollocationPath, DiscreteGradientScheme
-from .rounding import value_and_rounding_scale
-from .time_span import DeclaredTimes, FunctionWithBreaks, TimeSpan, checked_breaks
 
 
 @subprogram

@@ -1,17 +1,25 @@
-"""The time span of a run, and the times within it at which functions of time jump."""
+"""Functions of time and of a state and a time: their arguments, jumps and pieces, and the time span of a run."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import functools
+import inspect
+import math
+import sys
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy  # its module of splines is loaded where one is used
 
 from manifolds._arrays import is_traced
 from manifolds._pytree_module import Module
 
 from ..errors import InputError
+from .conditions import checked_numbers, require_condition
 
 BREAK_RTOL = 8.0 * float(np.finfo(np.float64).eps)
 """Largest rounding of the times of a run, relative to the largest: a step starts at a break if it starts so near."""
@@ -163,3 +171,324 @@ def checked_breaks(breaks) -> tuple[float, ...]:
     if times.ndim != 1 or not np.isfinite(times).all():
         raise InputError(f"breaks must be a list of finite times, got {breaks!r:.60}")
     return tuple(np.unique(times).tolist())
+
+
+def required_argument_count(function: Callable) -> int | None:
+    """Return the number of positional arguments without a default; None if a function has no signature."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        return None
+    return sum(p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) and p.default is p.empty for p in parameters)
+
+
+class FixedTimeFunction(Module):
+    """A function of the state and the time, at a fixed time."""
+
+    function: Callable
+    time: jax.Array
+
+    def __call__(self, x):
+        return self.function(x, self.time)
+
+
+class StateTimeFunction(Module):
+    """A function of the state and the time, as a function of the state with the time appended."""
+
+    function: Callable
+
+    def __call__(self, z):
+        return self.function(z[:-1], z[-1])
+
+
+class LastArgumentIgnored(Module):
+    """A function that accepts one more argument, the last, and ignores it."""
+
+    function: Callable
+
+    def __call__(self, *arguments):
+        return self.function(*arguments[:-1])
+
+
+class ConstantFunction(Module):
+    """A function that returns a constant for any arguments."""
+
+    value: jax.Array
+
+    def __call__(self, *arguments):
+        return self.value
+
+
+class NegatedFunction(Module):
+    """The negative of a function of the state and the time."""
+
+    function: Callable
+
+    def __call__(self, x, t):
+        return -jnp.asarray(self.function(x, t))
+
+
+class MultipleFunction(Module):
+    """A function of the state and the time, times a number."""
+
+    function: Callable
+    factor: jax.Array
+
+    def __call__(self, x, t):
+        return self.factor * jnp.asarray(self.function(x, t))
+
+
+class CoordinatesWithTime(Module):
+    """Coordinates of a state, with the time appended to the state and to the coordinates."""
+
+    coordinates: Callable
+
+    def __call__(self, z):
+        return jnp.append(self.coordinates(z[:-1]), z[-1])
+
+
+TableKind = Literal["linear", "cubic"]
+"""Interpolation of a table: straight lines, or a cubic spline with two continuous derivatives."""
+
+
+def is_spline(value: Any) -> bool:
+    """Return whether a value is a spline of SciPy, a function of one number from which a table can be made."""
+    if "scipy.interpolate" not in sys.modules:  # then there is none
+        return False
+    return isinstance(value, (*_splines_with_axis(), scipy.interpolate.UnivariateSpline))
+
+
+@functools.cache
+def _splines_with_axis() -> tuple[Any, ...]:
+    """Return the splines of SciPy whose values may be arrays, with the times along any axis."""
+    return scipy.interpolate.PPoly, scipy.interpolate.BPoly, scipy.interpolate.BSpline
+
+
+class PiecewiseConstant(FunctionWithBreaks):
+    """A function of time that is constant between given times and zero outside, such as a train of pulses.
+
+    At a time where it jumps it has its value from after the jump. The steps of a run end at these times.
+
+    Parameters
+    ----------
+    times : sequence of float, length m
+        Increasing times of the jumps. They are no parameters of a system: they decide where steps end.
+    values : array, shape (m - 1, ...)
+        The values between two of the times.
+
+    Raises
+    ------
+    InputError
+        If the times do not increase, or there is not one value for each interval.
+
+    Examples
+    --------
+    >>> pulses = lt.PiecewiseConstant([2.0, 2.5, 7.0], [1.0, -1.0])
+    >>> [float(pulses(t)) for t in (1.0, 2.0, 3.0, 7.0)]
+    [0.0, 1.0, -1.0, 0.0]
+    """
+
+    times: tuple[float, ...] = eqx.field(static=True)
+    values: jax.Array
+
+    def __init__(self, times, values):
+        self.times, self.values = checked_breaks(times), checked_numbers(values, "values")
+        if self.times != tuple(np.asarray(times, dtype=np.float64)) or self.values.shape[:1] != (len(self.times) - 1,):
+            raise InputError(
+                "PiecewiseConstant needs increasing times and one value for each interval between two of them, got "
+                f"{len(times)} times and values of shape {self.values.shape}"
+            )
+
+    @property
+    def break_times(self) -> tuple[float, ...]:
+        return self.times
+
+    def __call__(self, t) -> jax.Array:
+        if not self.values.shape[0]:
+            return jnp.zeros(self.values.shape[1:])
+        value = jnp.asarray(self.values)[interval_index(jnp.asarray(self.times), t)]
+        return jnp.where((t >= self.times[0]) & (t < self.times[-1]), value, jnp.zeros_like(value))
+
+
+class Table(FunctionWithBreaks):
+    """A function of time from a table; zero before the first time and after the last.
+
+    The interval that contains t is found by bisection, so that the time for a value and for the first answer of a run
+    grows with the logarithm of the length of the table. The numbers are parameters. The steps of a run end at the times
+    of a table joined by straight lines, and at the ends of others. They do not if the span has more than 1,000 of them,
+    or more than steps of a given size.
+
+    Parameters
+    ----------
+    times : array, shape (m,), or a spline of SciPy
+        Increasing times (time), at least two. From a spline (``CubicSpline``, ``PchipInterpolator``,
+        ``Akima1DInterpolator``, ``PPoly``, ``BPoly``, ``BSpline``, ``UnivariateSpline``) its polynomials are taken, and
+        its values outside of its interval are not: a table is zero there.
+    values : array, shape (m, ...), optional
+        Values at these times; not with a spline.
+    kind : {"linear", "cubic"}
+        Interpolation of the values: linear, or ``scipy.interpolate.CubicSpline`` with its default ends.
+    name : str
+        Name of the values in messages.
+
+    Attributes
+    ----------
+    times : array, shape (m,)
+    values : array, shape (m, ...), or None
+        The given values, if they are joined by straight lines.
+    coefficients : array, shape (m - 1, order, ...), or None
+        Otherwise the coefficients of ``(t - times[i])**j`` in each interval.
+
+    Raises
+    ------
+    InputError
+
+    Examples
+    --------
+    >>> thrust = lt.torques.Table([0.0, 1.0, 3.0], [0.0, 2.0, 2.0])
+    >>> [float(thrust(t)) for t in (-1.0, 0.5, 2.0, 4.0)]
+    [0.0, 1.0, 2.0, 0.0]
+    """
+
+    times: jax.Array
+    values: jax.Array | None
+    coefficients: jax.Array | None
+    shape: tuple[int, ...] = eqx.field(static=True)
+
+    def __init__(self, times, values=None, kind: TableKind = "linear", name: str = "values"):
+        if kind not in ("linear", "cubic"):
+            raise InputError(f"kind must be 'linear' or 'cubic', got {kind!r}")
+        if callable(times):
+            if values is not None:
+                raise InputError("values= belongs to times, but a spline was given, which has values")
+            self.times, self.coefficients = _pieces_of_spline(times)
+            self.values, self.shape = None, self.coefficients.shape[2:]
+            return
+        if values is None or callable(values):
+            raise InputError("a table needs times and values, or a spline of SciPy alone")
+        self.times, self.values = checked_numbers(times, "times"), checked_numbers(values, name)
+        if self.times.ndim != 1 or self.times.size < 2 or self.values.shape[:1] != self.times.shape:
+            raise InputError(
+                f"times must have shape (m,) with m >= 2, and {name} m rows, got {self.times.shape} and "
+                f"{self.values.shape}"
+            )
+        for label, numbers in {"times": self.times, name: self.values}.items():
+            require_condition(numbers, lambda v: abs(v) < jnp.inf, label + " must be finite, got {value}")
+        require_condition(self.times, lambda t: t[1:] > t[:-1], "the times of a table must increase, got {value}")
+        self.shape, self.coefficients = self.values.shape[1:], None
+        if kind == "cubic":
+            spline = scipy.interpolate.CubicSpline(np.asarray(self.times), np.asarray(self.values))
+            self.times, self.coefficients = _pieces_of_spline(spline)
+            self.values = None
+
+    @classmethod
+    def from_parts(cls, times, values, coefficients) -> Table:
+        """Return the table with these attributes, which are not checked."""
+        table = object.__new__(cls)
+        shape = values.shape[1:] if coefficients is None else coefficients.shape[2:]
+        for name, value in {"times": times, "values": values, "coefficients": coefficients, "shape": shape}.items():
+            object.__setattr__(table, name, value)
+        return table
+
+    @property
+    def kink_times(self) -> tuple[float, ...]:
+        return kinks_of_table(self.times, self.values is None)
+
+    def __call__(self, t) -> jax.Array:
+        times, n_intervals = jnp.asarray(self.times), self.times.shape[0] - 1
+        i = interval_index(times, t)
+        start = times[i]
+        if self.values is not None:
+            values = jnp.asarray(self.values)
+            fraction = (t - start) / (times[i + 1] - start)
+            value = (1.0 - fraction) * values[i] + fraction * values[i + 1]
+        else:
+            assert self.coefficients is not None
+            value = _polynomial_value(jnp.asarray(self.coefficients)[i], t - start)
+        return jnp.where((t >= times[0]) & (t <= times[n_intervals]), value, jnp.zeros(self.shape))
+
+
+def kinks_of_table(times: jax.Array, is_smooth: bool) -> tuple[float, ...]:
+    """Return the times at which a table has a kink: all of them, or the first and the last if its pieces are smooth.
+
+    There are none if the times are not known, because JAX traces them or they differ in an ensemble.
+    """
+    if is_traced(times) or not np.isfinite(times).all():
+        return ()
+    return tuple(np.asarray(times)[[0, -1] if is_smooth else slice(None)].tolist())
+
+
+class ContinuedSpline(Module):
+    """The polynomials of a spline of SciPy; the first and the last of them continue outside of its interval.
+
+    Attributes
+    ----------
+    times : array, shape (m,)
+    coefficients : array, shape (m - 1, order, ...)
+        Coefficients of ``(t - times[i])**j`` in each interval.
+    """
+
+    times: jax.Array
+    coefficients: jax.Array
+
+    def __init__(self, spline: Any):
+        self.times, self.coefficients = _pieces_of_spline(spline)
+
+    def __call__(self, t) -> jax.Array:
+        i = interval_index(self.times, t)
+        return _polynomial_value(self.coefficients[i], t - self.times[i])
+
+
+def _polynomial_value(coefficients: jax.Array, s) -> jax.Array:
+    """Return ``sum_j coefficients[j] s**j`` by Horner's scheme."""
+    value = coefficients[-1]
+    for j in range(coefficients.shape[0] - 2, -1, -1):
+        value = value * s + coefficients[j]
+    return value
+
+
+def interval_index(times: jax.Array, t) -> jax.Array:
+    """Return the index of the interval between increasing times that contains t, by bisection; clamped to the ends."""
+    n_intervals = times.shape[0] - 1
+    index = jnp.zeros((), dtype=jnp.int64)
+    step = 1 << max((n_intervals - 1).bit_length() - 1, 0)
+    while step:
+        trial = index + step
+        has_begun = (trial < n_intervals) & (times[jnp.minimum(trial, n_intervals - 1)] <= t)
+        index = jnp.where(has_begun, trial, index)
+        step //= 2
+    return index
+
+
+def _pieces_of_spline(spline: Any) -> tuple[jax.Array, jax.Array]:
+    """Return the times, shape (m,), and the ascending coefficients, shape (m - 1, order, ...), of a SciPy spline."""
+    axis = spline.axis if isinstance(spline, _splines_with_axis()) else 0
+    if axis != 0:
+        raise InputError(f"a spline must interpolate along axis 0, got axis {axis}")
+    if isinstance(spline, scipy.interpolate.BPoly):
+        spline = scipy.interpolate.PPoly.from_bernstein_basis(spline)
+    elif isinstance(spline, scipy.interpolate.UnivariateSpline):
+        spline = _bspline_on_its_interval(scipy.interpolate.BSpline(*spline._eval_args))
+    elif isinstance(spline, scipy.interpolate.BSpline):
+        spline = _bspline_on_its_interval(spline)
+    if not isinstance(spline, scipy.interpolate.PPoly):
+        raise InputError(
+            "a table is made of a piecewise polynomial of SciPy or of times and values, not of "
+            f"{type(spline).__name__}. Write Table(times, function(times), kind='cubic') with times at which its "
+            "values are to be taken"
+        )
+    times, coefficients = np.asarray(spline.x, dtype=float), np.asarray(spline.c)
+    if np.iscomplexobj(coefficients) or not (np.isfinite(times).all() and np.isfinite(coefficients).all()):
+        raise InputError("a spline must have real, finite coefficients")
+    if not (np.diff(times) > 0.0).all():
+        raise InputError("the breakpoints of a spline must increase")
+    return jnp.asarray(times), jnp.asarray(np.moveaxis(coefficients[::-1], 0, 1).astype(float))
+
+
+def _bspline_on_its_interval(spline: Any) -> Any:
+    """Return a B-spline of degree k as piecewise polynomials, from its knot k to the last knot but k."""
+    start, end = spline.t[spline.k], spline.t[-spline.k - 1]
+    breakpoints = np.unique(spline.t[(spline.t >= start) & (spline.t <= end)])
+    derivatives = [spline.derivative(j) if j else spline for j in range(spline.k + 1)]
+    coefficients = [f(breakpoints[:-1]) / math.factorial(j) for j, f in enumerate(derivatives)]
+    return scipy.interpolate.PPoly(np.stack(coefficients[::-1]), breakpoints)

@@ -174,10 +174,10 @@ class ExplicitMethod(TransportingMethod):
         that spins but does not translate. Near these the rotation that would cancel an error is much larger than the
         error. Momenta of internal parts, such as a wheel with friction, do not matter for the attitude.
         """
-        orbit_dim, casimirs = system.orbit_levels
+        orbit_dim, casimirs, has_all_casimirs = system.orbit_levels
         # With a torque, the impulse is projected onto the orbit instead.
-        casimirs_are_held = system.has_impulse or casimirs <= set(self.held)
-        return system.has_all_casimirs and casimirs_are_held and orbit_dim - len(casimirs) <= 2
+        casimirs_are_held = system.torque_laws.has_impulse or casimirs <= set(self.held)
+        return has_all_casimirs and casimirs_are_held and orbit_dim - len(casimirs) <= 2
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
         method_on_states = self._with_transformed_functions(
@@ -224,7 +224,7 @@ class ExplicitMethod(TransportingMethod):
         leaf, n, skip_law_rates = (
             self._can_follow_symplectic_leaf(system),
             x.shape[0],
-            has_generator(system) or system.dissipation is None,
+            has_generator(system) or not system.total_dissipation.terms,
         )
         laws = self._laws(system, leaf)
         start_gradients = [law.function.gradient(x + compensation) for law in laws]
@@ -340,11 +340,11 @@ class ExplicitMethod(TransportingMethod):
         if has_generator(system):
             return generator_field(system, x), jnp.zeros(len(laws))
         dH = system.energy.gradient(x)
-        if system.dissipation is None:
+        if not system.total_dissipation.terms:
             return system.field(x, dH, jnp.zeros_like(x)), jnp.zeros(len(laws))
         dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
         dL = tuple(L.gradient(x) for L in system.preserved)
-        terms = list(terms_with_preserved_values(system.dissipations, dL))
+        terms = list(terms_with_preserved_values(system.total_dissipation.terms, dL))
 
         def rate_by_dissipation(law: Law) -> jax.Array:
             """Return the rate by dissipation alone: near rest the motion would add rounding noise."""
@@ -362,7 +362,7 @@ class ExplicitMethod(TransportingMethod):
         Wheels and joints move the body also where the momentum of the whole is zero. It is 0 if there are no internal
         parts, or if the method does not hold the Casimirs of the momentum.
         """
-        dim, casimirs = system.orbit_levels
+        dim, casimirs, _ = system.orbit_levels
         return dim if casimirs and casimirs <= set(self.held) and dim < system.body_dim else 0
 
     def _can_follow_symplectic_leaf(self, system: System) -> bool:
@@ -371,7 +371,7 @@ class ExplicitMethod(TransportingMethod):
         This requires a structure that knows its leaves, and a Casimir that is not quadratic: the gradients of such
         Casimirs depend on each other at many states.
         """
-        if system.dissipation is not None:
+        if system.total_dissipation.terms:
             return False
         casimirs = [C for name, C in system.casimirs().items() if name in self.held]
         casimirs += [] if system.entropy is None else [system.entropy]

@@ -92,17 +92,15 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         z, dH, dS, dL = self.method.midpoint_and_gradients(system, x, compensation, h, k)
         factors_and_inputs = self._factors_and_inputs(system, z, dH, dL, h)
-        slope = system.field(z, dH, dS, dL) + sum(B.times(w) for B, w in factors_and_inputs)
+        field, noise = system.field(z, dH, dS, dL), [B.times(w) for B, w in factors_and_inputs]
         rotations = [
             B.spin_coefficients[..., None] * w.reshape(-1, 3)
             for B, w in factors_and_inputs
             if B.spin_coefficients is not None
         ]
-        if not rotations:
-            return slope[None]
-        # Solve for the rotation by noise at once: among many spins some rotate far, and the iteration would be slow.
-        change = system.solve_rotation(0.5 * h * sum(rotations), slope - k[0])
-        return (slope if change is None else k[0] + change)[None]
+        # Solve for the turn of each spin at once: among many spins some turn far, and the iteration would be slow.
+        change = system.solve_at_spins(z, dH, sum(rotations), 0.5 * h, [field, *noise, -k[0]]) if rotations else None
+        return (sum(noise, field) if change is None else k[0] + change)[None]
 
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
         z, dH, dS, dL = self.method.midpoint_and_gradients(system, x, compensation, h, k)
@@ -112,16 +110,16 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
         ]
 
     def can_transport_attitude(self, system: System) -> bool:
-        assert system.dissipation is not None
         point = jnp.asarray(system.samples(1)[0])
-        return all(B.velocity is not None for _, B in terms_with_factors_at_state(system.dissipation, system, point))
+        return all(
+            B.velocity is not None for _, B in terms_with_factors_at_state(system.total_dissipation, system, point)
+        )
 
     def _factors_and_inputs(self, system: System, z, dH, dL, h) -> list[tuple[Factor, jax.Array]]:
         """Return the factor of each summand with the vector, drift plus noise, that it is applied to."""
-        assert system.dissipation is not None
-        terms = terms_with_factors(system.dissipation, system, z, dH, dL)
+        terms = terms_with_factors(system.total_dissipation, system, z, dH, dL)
         split_indices = np.cumsum([B.size for _, B in terms])[:-1]
-        drift = factor_divergences(system.dissipation, system, z)
+        drift = factor_divergences(system.total_dissipation, system, z)
         if self.log_density is not None:
             drift = drift + concatenate_factors([B for _, B in terms]).transpose_times(self.log_density.gradient(z))
         factors_and_inputs = []
@@ -183,9 +181,9 @@ def stochastic_method(
     """
     if not isinstance(method, MetriplecticMidpoint):
         raise InputError(f"noise= works only with lt.MetriplecticMidpoint, got {method}")
-    if system.dissipation is None or all(part.is_noiseless for part in system.dissipation.terms):
+    if all(part.is_noiseless for part in system.total_dissipation.terms):
         raise InputError("noise= needs a system with a dissipation that has noise, and this one has none")
-    lowering_terms = [part for part in system.dissipation.terms if part.energy_law != "conserved"]
+    lowering_terms = [part for part in system.total_dissipation.terms if part.energy_law != "conserved"]
     if lowering_terms and temperature is None:
         raise InputError(
             f"{type(lowering_terms[0]).__name__} lowers the energy: give the temperature of the bath that takes it, "
@@ -207,8 +205,7 @@ def stochastic_method(
 
 def _count_factor_columns(system: System) -> int:
     """Return the total number of columns of the factors."""
-    assert system.dissipation is not None
-    dissipation, point = system.dissipation, jnp.asarray(system.samples(1)[0])
+    dissipation, point = system.total_dissipation, jnp.asarray(system.samples(1)[0])
     column_blocks = jax.eval_shape(
         lambda x: [jnp.zeros(B.size) for _, B in terms_with_factors_at_state(dissipation, system, x)], point
     )
@@ -253,8 +250,7 @@ def _noise_residuals_and_changes_at_samples(
 
 def _noise_residuals_and_changes(system: System, x):
     """Return the residual of ``B B^T = K``, and for each function the pair (change by noise, scale of that change)."""
-    assert system.dissipation is not None
-    B = concatenate_factors([B for _, B in terms_with_factors_at_state(system.dissipation, system, x)])
+    B = concatenate_factors([B for _, B in terms_with_factors_at_state(system.total_dissipation, system, x)])
     # The scale is the largest product with generic covectors, which none of the columns is orthogonal to.
     max_product = jnp.max(
         jnp.stack([jnp.max(jnp.abs(B.transpose_times(covector))) for covector in generic_covectors(x.shape[0], 2)])
@@ -266,4 +262,4 @@ def _noise_residuals_and_changes(system: System, x):
             jnp.max(jnp.abs(B.transpose_times(gradient)), initial=0.0),
             max_product * jnp.linalg.norm(gradient),
         )
-    return factor_check_residuals(system.dissipation, system, x)[FACTOR_SQUARE_CHECK], changes
+    return factor_check_residuals(system.total_dissipation, system, x)[FACTOR_SQUARE_CHECK], changes

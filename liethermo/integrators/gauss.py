@@ -19,8 +19,8 @@ from manifolds._arrays import is_traced
 from ..dissipation.base import Dissipation, terms_with_preserved_values
 from ..errors import InputError
 from ..functions.energy import Energy
-from ..functions.frames import gram_schmidt
-from ..functions.gradients import stage_gradients
+from ..functions.frames import OrthonormalFrame, gram_schmidt
+from ..functions.gradients import CorrectionDirection, FunctionChange, correct_gradients, stage_gradients
 from ..systems import System
 from ..systems.invariants import preserved_by_name, preserved_names, stack_gradients
 from ..systems.transport import has_generator
@@ -36,9 +36,51 @@ from .base import (
     register,
 )
 from .charts import wrap_in_charts
-from .composed_entropy import composed_entropy_gradients
 from .preserved import casimir_residuals, check_preserved, function_on_states, is_momentum_map, preserved_functions
 from .tableaus import gauss_tableau, kronrod_rule
+
+CASIMIR_NEWTON_STEPS = 3
+"""Newton steps to a level of the Casimirs: the distance is O(h), so O(h^8) is left after three."""
+
+
+def composed_entropy_gradients(
+    S: Energy, casimirs: Sequence[Energy], gradients, x, compensation, h, k, A, b
+) -> jax.Array:
+    """Return discrete gradients of ``S = f(C_1, …, C_m)`` at the stages of a collocation method, shape (s, n).
+
+    Each is ``sum_j (f_j(c_i) + alpha r_ij) gC_ij``, a combination of the discrete gradients of the Casimirs at the
+    stage. Their rates are ``r_ij = gC_ij . k_i``, and their values ``c_i = C(x) + h sum_l A_il r_l`` are collocated as
+    separate unknowns. The number alpha makes ``h sum_i b_i gS_i . k_i = S(x') - S(x)``. So a motion that keeps
+    the Casimirs keeps S. At a critical point of f, f' is zero, and so is gS. With the stage u_i
+    itself, which is off the level of the Casimirs by O(h^{s+1}), friction would act there.
+
+    f need not be known: its derivatives at c are the components of grad S in the grad C_j, at a point near x with C =
+    c.
+
+    Parameters
+    ----------
+    gradients : array, shape (m, s, n)
+        The discrete gradients of the Casimirs.
+    """
+    rates = jnp.einsum("jin,in->ij", gradients, k)
+
+    def casimir_frame(y) -> OrthonormalFrame:
+        return gram_schmidt([C.gradient(y) for C in casimirs])
+
+    def entropy_coefficients(casimir_changes):
+        y = x
+        for _ in range(CASIMIR_NEWTON_STEPS):
+            residual = casimir_changes - jnp.stack([C.value(y) - C.value(x) for C in casimirs])
+            y = y + casimir_frame(y).vector_with_inner_products(residual)
+        return casimir_frame(y).coefficients(S.gradient(y))
+
+    coefficients = jax.vmap(entropy_coefficients)(h * (A @ rates))
+    entropy_change = FunctionChange.of(S, x, compensation, h * (b @ k), [])
+    return jnp.einsum(
+        "ij,jin->in",
+        correct_gradients(entropy_change, coefficients, rates, CorrectionDirection.of(rates, b), h, b),
+        gradients,
+    )
 
 
 class MetriplecticGauss(GaussMethod, TransportingMethod):
@@ -182,7 +224,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         """
         functions = self._held_functions(system) | _entropy_arguments(system)
         casimirs = functions.keys() <= {ENTROPY_KEY, *self._casimir_names(system)}
-        if system.dissipation is not None or not casimirs or all(C.is_quadratic for C in functions.values()):
+        if system.total_dissipation.terms or not casimirs or all(C.is_quadratic for C in functions.values()):
             return None
         dH = self._energy_gradients(system, self._stage_states(x, compensation, h, k), x, compensation, h, k)
         points = system.poisson.stages_on_leaf(x + compensation, dH, h * gauss_tableau(self.number).A)
@@ -238,7 +280,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         system = system.freeze_at(u)
         slope = self._conservative_slope(system, u, dH, gradients_by_name)
         keys_and_names = tuple(zip(preserved_by_name(system), preserved_names(system), strict=True))
-        for term, preserved_keys in terms_with_preserved_values(system.dissipations, keys_and_names):
+        for term, preserved_keys in terms_with_preserved_values(system.total_dissipation.terms, keys_and_names):
             slope = slope + self._dissipative_slope(term, preserved_keys, system, u, dH, dS, gradients_by_name)
         return slope
 
@@ -310,7 +352,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     def can_transport_attitude(self, system: System) -> bool:
         """Return whether the steps determine the attitude exactly: they do if nothing is projected off the slopes."""
         names = preserved_names(system)
-        terms = terms_with_preserved_values(system.dissipations, names)
+        terms = terms_with_preserved_values(system.total_dissipation.terms, names)
         has_only_quadratics = all(
             C.is_quadratic for C in (self._held_functions(system) | _entropy_arguments(system)).values()
         )
@@ -331,8 +373,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         """
         if name not in system.casimirs() and name not in preserved_names(system):
             return False
-        is_projected = system.dissipation is None or system.dissipation.is_symmetric
-        return is_projected or system.functions()[name].is_quadratic
+        return system.total_dissipation.is_symmetric or system.functions()[name].is_quadratic
 
     def _held_functions(self, system: System) -> dict[str, Energy]:
         """Return the held functions by name."""
@@ -393,7 +434,7 @@ def _entropy_arguments(system: System) -> dict[str, Energy]:
     S = _entropy_with_a_law(system)
     if S is None:
         return {}
-    if S.is_quadratic or not system.has_all_casimirs:
+    if S.is_quadratic or not system.orbit_levels.has_all_casimirs:
         return {ENTROPY_KEY: S}
     return system.casimirs()
 
@@ -403,8 +444,8 @@ def _entropy_with_a_law(system: System) -> Energy | None:
 
     A projection of the motion off its gradient would then only lower the order, where that gradient is infinite.
     """
-    dissipation = system.dissipation
-    has_no_part = dissipation is not None and dissipation.has_generator and not dissipation.needs_entropy
+    dissipation = system.total_dissipation
+    has_no_part = dissipation.has_generator and not dissipation.needs_entropy
     return None if has_no_part and system.entropy_law is None else system.entropy
 
 

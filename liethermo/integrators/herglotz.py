@@ -15,11 +15,11 @@ from manifolds._pytree_module import Module
 from manifolds.matrices.linear import solve
 
 from ..errors import InputError
-from ..functions.arguments import required_argument_count
 from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers
 from ..functions.energy import Energy, make_energy
 from ..functions.surface import ConstraintSurface
+from ..functions.time_span import required_argument_count
 from ..systems import EmbeddedSystem, EvolutionSystem, System
 from .base import WHY_FIXED_VARIATIONAL_STEP, OneStepMethod, apply_increment, checked_step_size
 

@@ -94,7 +94,7 @@ class KrausMethod(OneStepMethod):
         body = system.body if isinstance(system, DrivenSystem) else system
         if not isinstance(body, QuantumSystem):
             raise InputError(f"KrausMethod needs an lt.QuantumSystem, got a {kind_or_class_name(body)}")
-        terms = () if body.dissipation is None else body.dissipation.terms
+        terms = body.total_dissipation.terms
         if not terms or not all(isinstance(term, LindbladJumps) for term in terms):
             raise InputError(
                 "KrausMethod needs lt.LindbladJumps and no other dissipation. For lt.ThermalJumps use "
@@ -156,8 +156,7 @@ class _Channel(NamedTuple):
         if time is not None:
             assert isinstance(system, DrivenSystem)
             frozen = {c: _quantum_body(body.at_time(system.span.clip(time + c * h))) for c in fractions}
-        assert body.dissipation is not None
-        terms = [term for term in body.dissipation.terms if isinstance(term, LindbladJumps)]
+        terms = [term for term in body.total_dissipation.terms if isinstance(term, LindbladJumps)]
 
         def operators(c) -> np.ndarray | jax.Array:
             parts = [term.operators_at(frozen[c].time) for term in terms]

@@ -102,7 +102,7 @@ class WithAttitude(MethodWrapper):
                 local, local.local_coordinates(x), local.local_coordinates(compensation), h, k
             )
         body = system.body
-        if not (isinstance(body, DrivenSystem) and body.needs_attitude):
+        if not (isinstance(body, DrivenSystem) and body.torque_laws.needs_attitude):
             return method.slopes(body, mu, mu_compensation, h, k)
         slopes_for_torque = jax.vmap(lambda torque: method.slopes(body.with_torque(torque), mu, mu_compensation, h, k))
         slopes_by_torque = slopes_for_torque(
@@ -128,7 +128,7 @@ class WithAttitude(MethodWrapper):
     def initial_compensation(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
         mu, g = system.split_state(x)
         attitude_correction = _group_correction(system.group, g) if self.kind == "cayley" else jnp.zeros_like(g)
-        momentum = jnp.zeros_like(system.spatial_impulse(x)) if system.torque_name else None
+        momentum = jnp.zeros_like(system.spatial_impulse(x)) if system.torque_laws.name else None
         return system.join_state(self.method.initial_compensation(system.body, mu), attitude_correction, momentum)
 
     # -- the attitude, which follows from it --------------------------------------------------------------------------
@@ -143,7 +143,7 @@ class WithAttitude(MethodWrapper):
             * self._transporting_method.stage_velocities(system.body, mu, mu_compensation, h, k)[:, : system.group.dim]
         )
         p, p_compensation = (
-            self._next_spatial_momentum(system, x, compensation, h, k, xi) if system.has_impulse else (None, None)
+            self._next_spatial_momentum(system, x, compensation, h, k, xi) if system.impulse_dim else (None, None)
         )
         if self.kind == "cayley":
             dg = (g + g_compensation) @ _collocation_increment(system.group.algebra.hat(xi))
@@ -166,7 +166,7 @@ class WithAttitude(MethodWrapper):
             is_torque_free(system.body) and self._transporting_method.can_transport_attitude(system.body),
             None,
         )
-        if system.has_impulse:
+        if system.impulse_dim:
             p, p_compensation = two_sum(
                 system.spatial_impulse(x), system.spatial_impulse(compensation) + local.spatial_impulse(step)
             )
@@ -177,7 +177,7 @@ class WithAttitude(MethodWrapper):
         if keeps_orbit:
             new_g = _align_attitude(group, new_g, p, new_mu[:n])
         new_g = group.restore_map(new_g)
-        return system.join_state(new_mu, new_g, p if system.has_impulse else None), system.join_state(
+        return system.join_state(new_mu, new_g, p if system.impulse_dim else None), system.join_state(
             new_mu_compensation, jnp.zeros_like(g), p_compensation
         )
 
@@ -224,7 +224,7 @@ class WithAttitude(MethodWrapper):
         """Return the torques at the stages, shape (stages, body components without the clock)."""
         body, states = system.body, system.points(x) + (system.points(compensation) + h * (gauss_tableau(len(k)).A @ k))
         assert isinstance(body, DrivenSystem)
-        if not body.needs_attitude:
+        if not body.torque_laws.needs_attitude:
             return jax.vmap(body.external_torque)(states)
         attitudes = self._stage_attitudes(system, x, compensation, h, k)
         return jax.vmap(lambda g, state: body.bind_attitude(g).external_torque(state))(attitudes, states)

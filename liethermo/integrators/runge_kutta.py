@@ -16,7 +16,7 @@ from ..systems import System
 from ..systems.clock import error_of_step
 from .base import register
 from .explicit import ExplicitMethod, StepRow, UncorrectedStep
-from .lobatto import LOBATTO_ORDERS, ErrorEstimate, ExplicitTableau, lobatto_tableau
+from .tableaus import LOBATTO_ORDERS, ErrorEstimate, ExplicitTableau, lobatto_tableau
 
 START_SLOPE_ROW = StepRow.FIRST_METHOD_ROW
 """Row of ``k`` that holds the slope at the start of a step."""
@@ -173,7 +173,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
         return weights_of_cubic(theta, self.stages)
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
-        """Return the larger one of the two estimates of :class:`.lobatto.ExplicitTableau`."""
+        """Return the larger one of the two estimates of :class:`.tableaus.ExplicitTableau`."""
         t, step_length = self.tableau, h * jnp.max(jnp.abs(k[StepRow.MEAN_SLOPE]))
 
         def estimated_error(estimate: ErrorEstimate, row: int) -> jax.Array:

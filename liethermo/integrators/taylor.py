@@ -19,7 +19,7 @@ from ..tracing.taylor import TaylorSeriesError, check_taylor_series, increment_t
 from .base import OneStepMethod, register
 from .charts import resolve_retraction
 from .explicit import ExplicitMethod, StepRow, UncorrectedStep
-from .lobatto import lobatto_rule
+from .tableaus import lobatto_rule
 
 MIN_ORDER = 2
 """Lowest order of a Taylor method."""
@@ -112,7 +112,7 @@ class MetriplecticTaylor(ExplicitMethod):
         super().check(system)
         x = jnp.asarray(system.samples(1)[0])
         functions = {"the energy": system.energy.value, "the vector field": system.vector_field}
-        if system.entropy is not None and system.dissipation is not None and not has_generator(system):
+        if system.entropy is not None and system.total_dissipation.terms and not has_generator(system):
             functions["the entropy"] = system.entropy.value
         for name, function in functions.items():
             try:

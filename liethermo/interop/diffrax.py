@@ -11,7 +11,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 
-from manifolds._names import public_dir
+from manifolds._arguments import public_dir
 
 from ..errors import InputError
 from ..functions.checks import trace_energies

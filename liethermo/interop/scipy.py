@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from manifolds._names import public_dir
+from manifolds._arguments import public_dir
 from manifolds.errors import warn
 
 from ..errors import InputError

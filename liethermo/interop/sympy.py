@@ -19,7 +19,7 @@ import numpy as np
 import sympy
 
 import manifolds as mf
-from manifolds._names import public_dir
+from manifolds._arguments import public_dir
 
 from .. import disk
 from ..errors import InputError

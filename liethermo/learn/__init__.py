@@ -1,13 +1,11 @@
 """Fit parameters and neural networks of systems to data; both laws hold by construction before, during and after."""
 
-from manifolds._names import public_dir
+from manifolds._arguments import public_dir
 
 from .files import load, save
 from .fitting import fit
 from .identifiability import Determined, Fits, determined, several
-from .model import Metriplectic
-from .networks import Learned
-from .parts import Energy, Entropy, Friction, Poisson
+from .parts import Energy, Entropy, Friction, Learned, Metriplectic, Poisson
 from .records import Records, Trajectory, read_data
 from .training import ConfidenceInterval, FitWarning, Training
 

@@ -31,9 +31,9 @@ from .data import (
 )
 from .least_squares import LeastSquaresProblem, fit_by_least_squares
 from .losses import Objective
-from .model import has_learned_parts, scale_networks
 from .observation import default_states, make_observation, n_displacement_coordinates, states_matching_rates
 from .parameters import build_checked, initial_parameters, named_parameter_vector
+from .parts import has_learned_parts, scale_networks
 from .refining import MAX_PARAMETERS, RunModel, can_refine, pad_runs, refine_by_least_squares, whole_trajectories
 from .training import FitWarning, Phase, Training, TrainingRun, empty_training, fingerprint
 

@@ -18,10 +18,8 @@ from ..runs.flow import differentiable_step, initial_carry
 from ..runs.preparation import prepare_for_method
 from ..systems import System
 from .data import DataScales, Trajectory, Windows, spline_states_and_rates
-from .model import copy_entropy_to_poisson
-from .networks import learned_mask
 from .observation import Observation, entry_names
-from .parts import Poisson
+from .parts import Poisson, copy_entropy_to_poisson, learned_mask
 
 MEAN_SQUARE_RATE_FLOOR = 0.1
 """Mean square of the rates of change, in units of their scale, that is added to the denominator of the matching loss,

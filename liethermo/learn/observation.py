@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -14,12 +15,22 @@ import numpy as np
 import manifolds as mf
 
 from ..errors import FunctionError, IndexOutOfRangeError, InputError
-from ..functions.arguments import required_argument_count
+from ..functions.time_span import required_argument_count
 from ..results.solution import Solution
 from ..systems import AttitudeSystem, System
 from ..tracing.index_check import checked_result_shapes
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
-from .compile_options import fast_compile_options
+
+
+def fast_compile_options() -> dict[str, Any]:
+    """Return options with which long programs of derivatives compile sooner and run about as fast.
+
+    A level of optimisation that the user has set is respected.
+    """
+    if "optimization_level" in os.environ.get("XLA_FLAGS", ""):
+        return {}
+    return {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
+
 
 LEVENBERG_ITERATIONS = 30
 """Number of Levenberg-Marquardt iterations in the search for an initial state."""

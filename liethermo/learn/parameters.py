@@ -11,7 +11,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from ..errors import FunctionError, InputError
-from ..runs.flow_times import system_with_parameters
+from ..runs.flow import system_with_parameters
 from ..runs.named_parameters import find_parameter
 from ..systems import System
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message

@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..integrators import OneStepMethod
-from .compile_options import fast_compile_options
 from .data import Trajectory
 from .losses import ParameterVector, differentiable_stepper
-from .networks import Perceptron
-from .observation import Observation, n_displacement_coordinates
+from .observation import Observation, fast_compile_options, n_displacement_coordinates
+from .parts import Perceptron
 
 MAX_PARAMETERS = 64
 """Largest number of learned parameters for a refinement; its cost grows with their number."""

@@ -20,9 +20,9 @@ from manifolds._class_members import ListedType
 from .. import disk
 from ..errors import FileError, InputError
 from ..runs.progress import Progress
-from .compile_options import fast_compile_options
 from .descent import soap_optimiser
 from .losses import Objective, ParameterVector
+from .observation import fast_compile_options
 from .refining import LeastSquaresResult
 
 STEPS_PER_EVALUATION = 50

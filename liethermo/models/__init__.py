@@ -5,26 +5,17 @@ A function ``model_solution`` in the module of a model returns the exact solutio
 
 from __future__ import annotations
 
-from manifolds._names import public_dir
+from manifolds._arguments import public_dir
 
 from .body_with_wheels import body_with_wheels
-from .cylinder import cylinder
-from .gas_piston import gas_piston
-from .heat_grid import heat_grid
-from .magnetic_fluid import magnetic_fluid
-from .mass_spring_gas import mass_spring_gas
-from .micromagnet import micromagnet
-from .open_gases import IdealMixture, porous_piston, reaction_vessel
-from .oscillator import damped_oscillator
-from .quantised_sphere import QuantisedSphere
-from .rigid_body import free_rigid_body, rigid_body
+from .gases import IdealMixture, cylinder, gas_piston, mass_spring_gas, porous_piston, reaction_vessel
+from .quantised_sphere import QuantisedSphere, magnetic_fluid, zeitlin
+from .rigid_body import free_rigid_body, rigid_body, tumbling_body
 from .rotors import damper_wheel, dual_spin, reaction_wheels, ring_damper
 from .sorting_flow import hermitian_matrix, hermitian_state, sorting_flow, toda_flow
-from .spins import single_spin, spin_lattice
-from .thermo_particles import moving_thermo_particles, thermo_particles, thermo_springs
-from .thermoelastic_chain import thermoelastic_chain
-from .tumbling_body import tumbling_body
-from .zeitlin import zeitlin
+from .spins import micromagnet, single_spin, spin_lattice
+from .springs import damped_oscillator, thermoelastic_chain
+from .thermo_particles import heat_grid, moving_thermo_particles, thermo_particles, thermo_springs
 
 __all__ = [
     "IdealMixture",

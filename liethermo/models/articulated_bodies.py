@@ -14,6 +14,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from manifolds._pytree_module import Module
 
@@ -29,17 +30,40 @@ class Poses(NamedTuple):
 
     Attributes
     ----------
-    rotations : list of array, shape (3, 3)
+    rotations : array, shape (k + 1, 3, 3)
         Rotation from axes of each link to axes of the base.
-    positions : list of array, shape (3,)
+    positions : array, shape (k + 1, 3)
         Origin of each link, from the origin of the base.
-    screws : list of array, shape (6,)
+    joint_screws : array, shape (k, 6)
         Screw of the joint that moves each link but the base.
     """
 
-    rotations: list[jax.Array]
-    positions: list[jax.Array]
-    screws: list[jax.Array]
+    rotations: jax.Array
+    positions: jax.Array
+    joint_screws: jax.Array
+
+
+class SpatialInertias(NamedTuple):
+    """Inertias about the origin of the base, of which momenta are linear functions; an axis of them stands first.
+
+    Attributes
+    ----------
+    mass : array, shape (n,)
+    first_moment : array, shape (n, 3)
+        Mass times centre of mass.
+    rotational : array, shape (n, 3, 3)
+        Tensor of inertia about the origin of the base.
+    """
+
+    mass: jax.Array
+    first_moment: jax.Array
+    rotational: jax.Array
+
+    def momentum(self, velocity) -> jax.Array:
+        """Return the spatial momentum at a spatial velocity, both of shape (n, 6)."""
+        omega, v = velocity[:, :3], velocity[:, 3:]
+        angular = _products(self.rotational, omega) + jnp.cross(self.first_moment, v)
+        return jnp.concatenate([angular, self.mass[:, None] * v - jnp.cross(self.first_moment, omega)], axis=1)
 
 
 class Motion(NamedTuple):
@@ -113,32 +137,89 @@ class ArticulatedBodies(Module):
         """Index of the first joint coordinate in a state: 3, behind the angular momentum, or 0 on the ground."""
         return 0 if self.is_fixed else 3
 
+    # -- which joints move what: constants of the tree ----------------------------------------------------------------
+
+    @property
+    def _moved_by(self) -> np.ndarray:
+        """Truth of "joint j moves link i", shape (k + 1, k)."""
+        moved_by = np.zeros((self.n_joints + 1, self.n_joints), bool)
+        for i, parent in enumerate(self.parents):
+            moved_by[i + 1] = moved_by[parent]
+            moved_by[i + 1, i] = True
+        return moved_by
+
+    @property
+    def _bodies_beyond(self) -> np.ndarray:
+        """Matrix that sums over the bodies that move with each link, shape (k + 1, m); those of the base are all."""
+        links = np.array(self.body_links)
+        return np.concatenate([np.ones((1, len(links))), self._moved_by[links].T])
+
+    @property
+    def _n_base_screws(self) -> int:
+        return 0 if self.is_fixed else 6
+
+    # -- kinematics and inertia ---------------------------------------------------------------------------------------
+
     def poses(self, q) -> Poses:
-        """Return rotations and positions of all links and the screws of the joints, for joint coordinates q."""
-        rotations, positions, screws = [jnp.eye(3)], [jnp.zeros(3)], []
-        for i, (parent, slides) in enumerate(zip(self.parents, self.slides, strict=True)):
-            R, axis = rotations[parent], rotations[parent] @ self.axes[i]
-            position = positions[parent] + R @ self.places[i]
-            if slides:
-                screws.append(jnp.concatenate([jnp.zeros(3), axis]))
-                position = position + q[i] * axis
-            else:
-                screws.append(jnp.concatenate([axis, jnp.cross(position, axis)]))
-                R = R @ _rotation(self.axes[i], q[i])
-            rotations.append(R)
-            positions.append(position)
+        """Return rotations and positions of all links and the screws of the joints, for joint coordinates q.
+
+        The pose of each link in its parent is composed with that of the parent, then with that of the parent's parent,
+        and so on with twice as many links each time, for all links at once.
+        """
+        slides = np.array(self.slides)[:, None]
+        turns = _rotations(self.axes, jnp.where(slides[:, 0], 0.0, q))
+        strokes = jnp.where(slides, q[:, None] * self.axes, 0.0)
+        rotations = jnp.concatenate([jnp.eye(3)[None], turns])
+        positions = jnp.concatenate([jnp.zeros((1, 3)), self.places + strokes])
+        references = np.array([0, *self.parents])  # the link in whose axes the pose of each link is known
+        while references.any():
+            positions = positions[references] + _products(rotations[references], positions)
+            rotations = rotations[references] @ rotations
+            references = references[references]
+        axes = _products(rotations[np.array(self.parents)], self.axes)
+        screws = jnp.where(
+            slides,
+            jnp.concatenate([jnp.zeros_like(axes), axes], axis=1),
+            jnp.concatenate([axes, jnp.cross(positions[1:], axes)], axis=1),
+        )
         return Poses(rotations, positions, screws)
 
-    def spatial_inertias(self, poses: Poses) -> list[jax.Array]:
-        """Return the spatial inertia of each link, shape (6, 6); zero for a link without a body."""
-        inertias = [jnp.zeros((6, 6))] * (self.n_joints + 1)
-        for body, link in enumerate(self.body_links):
-            R, mass = poses.rotations[link], self.masses[body]
-            centre = _cross_matrix(poses.positions[link] + R @ self.centres[body])
-            coupling = mass * centre
-            rotational = R @ self.inertias[body] @ R.T - coupling @ centre
-            inertias[link] = jnp.block([[rotational, coupling], [-coupling, mass * jnp.eye(3)]])
-        return inertias
+    def body_centres(self, poses: Poses) -> jax.Array:
+        """Return the centre of mass of each body, from the origin of the base, shape (m, 3)."""
+        links = np.array(self.body_links)
+        return poses.positions[links] + _products(poses.rotations[links], self.centres)
+
+    def central_inertias(self, poses: Poses) -> jax.Array:
+        """Return the tensor of inertia of each body about its centre of mass, in axes of the base, shape (m, 3, 3)."""
+        R = poses.rotations[np.array(self.body_links)]
+        return R @ self.inertias @ jnp.swapaxes(R, 1, 2)
+
+    def composite_inertias(self, poses: Poses) -> SpatialInertias:
+        """Return for each link the inertia of all bodies that move with it, n = k + 1; the base moves all."""
+        centres, masses = self.body_centres(poses), self.masses[:, None]
+        squares = jnp.sum(centres**2, axis=1)[:, None, None] * jnp.eye(3) - centres[:, :, None] * centres[:, None, :]
+        rotational = self.central_inertias(poses) + masses[:, :, None] * squares
+        inertias = jnp.concatenate([masses, masses * centres, rotational.reshape(-1, 9)], axis=1)
+        sums = jnp.asarray(self._bodies_beyond) @ inertias
+        return SpatialInertias(sums[:, 0], sums[:, 1:4], sums[:, 4:].reshape(-1, 3, 3))
+
+    def screws(self, poses: Poses) -> jax.Array:
+        """Return the screws of all velocities: the six of a free base, angular ones first, then those of the joints."""
+        return jnp.concatenate([jnp.eye(6)[: self._n_base_screws], poses.joint_screws])
+
+    def _inertia_matrix(self, screws, composites: SpatialInertias) -> jax.Array:
+        """Return the matrix H of the kinetic energy ``v . H v / 2``, v the velocities along all screws, shape (n, n).
+
+        By the composite-body recursion: ``H_ij = S_j . I_i S_i`` if j is i or moves all that i moves, and I_i is the
+        inertia of all bodies that i moves.
+        """
+        b = self._n_base_screws
+        links = np.array([0] * b + list(range(1, self.n_joints + 1)))
+        momenta = SpatialInertias(*(part[links] for part in composites)).momentum(screws)
+        is_below = np.pad(self._moved_by[1:], ((b, 0), (b, 0)))  # (i, j): screw j is i or moves all that i moves
+        is_below[:, :b] = np.tri(b + self.n_joints, b, dtype=bool)
+        entries = jnp.where(is_below, momenta @ screws.T, 0.0)
+        return entries + jnp.where(is_below & ~np.eye(len(links), dtype=bool), entries, 0.0).T
 
     def mass_matrix(self, q) -> jax.Array:
         """Return M(q), shape (3 + k, 3 + k), for which the kinetic energy is ``(Omega, q') . M(q) (Omega, q') / 2``.
@@ -146,26 +227,15 @@ class ArticulatedBodies(Module):
         The linear momentum is zero. M is the matrix of a free base by the composite-body recursion, with the linear
         velocity eliminated by a Schur complement, whose pivot is the total mass. On the ground M has the shape (k, k).
         """
-        k, poses = self.n_joints, self.poses(q)
-        composites = self.spatial_inertias(poses)
-        base_columns, M = [jnp.zeros(6)] * k, jnp.zeros((k, k))
-        for i in reversed(range(k)):
-            momentum = composites[i + 1] @ poses.screws[i]
-            ancestor = i
-            while ancestor >= 0:
-                entry = jnp.dot(poses.screws[ancestor], momentum)
-                M = M.at[i, ancestor].set(entry).at[ancestor, i].set(entry)
-                ancestor = self.parents[ancestor] - 1
-            base_columns[i] = momentum
-            composites[self.parents[i]] += composites[i + 1]
+        poses = self.poses(q)
+        H = self._inertia_matrix(self.screws(poses), self.composite_inertias(poses))
         if self.is_fixed:
-            return M
-        columns = jnp.stack(base_columns, axis=1)
-        locked = composites[0]
-        angular = jnp.concatenate([locked[:3, :3], columns[:3]], axis=1)
-        joints = jnp.concatenate([columns[:3].T, M], axis=1)
-        linear = jnp.concatenate([locked[3:, :3], columns[3:]], axis=1)
-        return jnp.concatenate([angular, joints]) - linear.T @ linear / jnp.sum(self.masses)
+            return H
+        kept = np.delete(np.arange(len(H)), [3, 4, 5])
+        linear = H[3:6, kept]
+        return H[np.ix_(kept, kept)] - linear.T @ linear / jnp.sum(self.masses)
+
+    # -- energy and velocities of given momenta -----------------------------------------------------------------------
 
     def momentum_scale(self, Pi, q, p) -> jax.Array:
         """Return the size of the terms whose sum is the angular momentum, shape (): ``sqrt(2 T J)``.
@@ -173,21 +243,28 @@ class ArticulatedBodies(Module):
         T is the kinetic energy, and J the trace of the locked inertia about the origin of the base. The terms of a tree
         without angular momentum cancel.
         """
-        inertias = self.spatial_inertias(self.poses(q))
-        locked = sum(jnp.trace(inertia[:3, :3]) for inertia in inertias)
+        locked = jnp.trace(self.composite_inertias(self.poses(q)).rotational[0])
         return jnp.sqrt(2.0 * self.kinetic_energy(Pi, q, p) * locked)
 
     def pivots(self, q) -> jax.Array:
         """Return the inertia that each joint moves if all joints beyond it are free, shape (k,)."""
-        return jnp.stack([joint.pivot for joint in self._eliminate(q, jnp.zeros(3), jnp.zeros(self.n_joints))[1]])
+        poses = self.poses(q)
+        H = self._inertia_matrix(self.screws(poses), self.composite_inertias(poses))
+        steps = _eliminate_velocities(H, jnp.zeros(len(H)))
+        return jnp.stack([step.pivot for step in steps[: self.n_joints]])[::-1]
 
     def kinetic_energy(self, Pi, q, p) -> jax.Array:
-        """Return the kinetic energy ``(Pi, p) . M(q)^-1 (Pi, p) / 2`` by the articulated-body recursion, O(k)."""
-        _, joints, base = self._eliminate(q, Pi, p)
-        return _sum_of_squares(joints, base)
+        """Return the kinetic energy ``(Pi, p) . M(q)^-1 (Pi, p) / 2``, a sum of squares."""
+        poses = self.poses(q)
+        H = self._inertia_matrix(self.screws(poses), self.composite_inertias(poses))
+        return _sum_of_squares(_eliminate_velocities(H, self._momenta(Pi, p)))
+
+    def _momenta(self, Pi, p) -> jax.Array:
+        """Return the momenta that belong to all screws. Without linear momentum Pi is the same about every point."""
+        return p if self.is_fixed else jnp.concatenate([Pi, jnp.zeros(3), p])
 
     def motion(self, Pi, q, p) -> Motion:
-        """Return the velocities for an angular momentum Pi and joint momenta p, O(k); see :class:`Motion`.
+        """Return the velocities for an angular momentum Pi and joint momenta p; see :class:`Motion`.
 
         On the ground Pi does not count.
 
@@ -198,65 +275,40 @@ class ArticulatedBodies(Module):
         An error dI of the inertia that a link moves changes the energy by ``-V . dI V / 2``. The entries of an inertia
         are rounded to eps of the square roots of its diagonal, before the free joints lower it.
         """
-        poses, joints, base = self._eliminate(q, Pi, p)
-        V = _base_velocity(base) if base else jnp.zeros(6)
-        velocities, rates = [V], []
-        for joint, parent, screw in zip(joints, self.parents, poses.screws, strict=True):
-            rate = (joint.impulse - jnp.dot(joint.column, velocities[parent])) / joint.pivot
-            rates.append(rate)
-            velocities.append(velocities[parent] + rate * screw)
-        inertias = self.spatial_inertias(poses)
-        momenta = [inertia @ velocity for inertia, velocity in zip(inertias, velocities, strict=True)]
-        gradient = [jnp.zeros(())] * self.n_joints
-        for i in reversed(range(self.n_joints)):
-            gradient[i] = jnp.dot(momenta[i + 1], _motion_cross(poses.screws[i], velocities[i + 1]))
-            momenta[self.parents[i]] += momenta[i + 1]
-        diagonals = [jnp.diagonal(inertia) for inertia in inertias]
-        for i in reversed(range(self.n_joints)):
-            diagonals[self.parents[i]] += diagonals[i + 1]
-        scales = [jnp.sum(jnp.abs(v) * jnp.sqrt(d)) ** 2 for v, d in zip(velocities, diagonals, strict=True)]
-        energy, rounding_scale = _sum_of_squares(joints, base), 0.5 * jnp.sum(jnp.stack(scales))
-        return Motion(energy, V[:3], jnp.stack(rates), jnp.stack(gradient), rounding_scale)
+        poses, b = self.poses(q), self._n_base_screws
+        composites, screws = self.composite_inertias(poses), self.screws(poses)
+        steps = _eliminate_velocities(self._inertia_matrix(screws, composites), self._momenta(Pi, p))
+        rates = _velocities(steps)
+        moves = np.concatenate([np.ones((self.n_joints + 1, b)), self._moved_by], axis=1)
+        velocities = moves @ (rates[:, None] * screws)
+        momenta = self._bodies_beyond[1:] @ self._body_momenta(poses, velocities[np.array(self.body_links)])
+        gradient = jnp.sum(momenta * _motion_cross(poses.joint_screws, velocities[1:]), axis=1)
+        diagonals = [jnp.diagonal(composites.rotational, axis1=1, axis2=2), jnp.tile(composites.mass[:, None], 3)]
+        scales = jnp.sum(jnp.abs(velocities) * jnp.sqrt(jnp.concatenate(diagonals, axis=1)), axis=1) ** 2
+        angular_velocity = jnp.zeros(3) if self.is_fixed else rates[:3]
+        return Motion(_sum_of_squares(steps), angular_velocity, rates[b:], gradient, 0.5 * jnp.sum(scales))
 
-    def _eliminate(self, q, Pi, p) -> tuple[Poses, list[_Elimination], list[_Elimination]]:
-        """Eliminate the joint rates from the leaves to the base, then the velocity of the base.
-
-        ``T(V, q') - p . q'`` is minimal at the rates ``q_i' = (u_i - U_i . V_parent) / D_i``, and the rest of the tree
-        then sees the articulated inertia ``I - U U^T / D`` and the bias ``U u / D``. The linear momentum is zero, so
-        the angular momentum is the same about every point.
-        """
-        poses = self.poses(q)
-        inertias = self.spatial_inertias(poses)
-        biases = [jnp.zeros(6)] * (self.n_joints + 1)
-        joints: list[_Elimination] = []
-        for i in reversed(range(self.n_joints)):
-            joint = _Elimination.from_inertia(inertias[i + 1], biases[i + 1], poses.screws[i], p[i])
-            joints.append(joint)
-            inertias[self.parents[i]] += joint.reduced_inertia(inertias[i + 1])
-            biases[self.parents[i]] += joint.bias(biases[i + 1])
-        base = [] if self.is_fixed else _eliminate_base(inertias[0], biases[0], Pi)
-        return poses, joints[::-1], base
+    def _body_momenta(self, poses: Poses, velocities) -> jax.Array:
+        """Return the spatial momentum of each body at its spatial velocity, both of shape (m, 6)."""
+        centres, omega = self.body_centres(poses), velocities[:, :3]
+        linear = self.masses[:, None] * (velocities[:, 3:] + jnp.cross(omega, centres))
+        angular = _products(self.central_inertias(poses), omega) + jnp.cross(centres, linear)
+        return jnp.concatenate([angular, linear], axis=1)
 
     # -- gravity ------------------------------------------------------------------------------------------------------
 
-    def body_centres(self, poses: Poses) -> list[jax.Array]:
-        """Return the centre of mass of each body, from the origin of the base, shape (3,) each."""
-        links = zip(self.body_links, self.centres, strict=True)
-        return [poses.positions[link] + poses.rotations[link] @ centre for link, centre in links]
-
     def common_centre(self, poses: Poses) -> jax.Array:
         """Return the centre of mass of the whole, from the origin of the base, shape (3,)."""
-        return self.masses @ jnp.stack(self.body_centres(poses)) / jnp.sum(self.masses)
+        return self.masses @ self.body_centres(poses) / jnp.sum(self.masses)
 
     def weight_potential(self, q, gravity) -> jax.Array:
         """Return the potential energy ``-sum m_j g . r_j`` in a uniform field g, shape (3,), from the ground."""
-        return -jnp.dot(gravity, self.masses @ jnp.stack(self.body_centres(self.poses(q))))
+        return -jnp.dot(gravity, self.masses @ self.body_centres(self.poses(q)))
 
     def weight_forces(self, q, gravity) -> jax.Array:
         """Return the forces of a uniform field on the joint coordinates, shape (k,)."""
-        poses = self.poses(q)
-        forces = [mass * gravity for mass in self.masses]
-        return self._collect_wrenches(poses, forces, [jnp.zeros(3)] * len(forces))[0]
+        forces = self.masses[:, None] * gravity
+        return self._collect_wrenches(self.poses(q), forces, jnp.zeros_like(forces))[0]
 
     def tidal_forces(self, q, direction) -> tuple[jax.Array, jax.Array]:
         """Return the torque on the whole, shape (3,), and the joint forces, shape (k,), in a gradient of gravity.
@@ -265,106 +317,92 @@ class ArticulatedBodies(Module):
         centre of the orbit, in axes of the base, times ``G M / r**3``. The inertia of a body about its own centre of
         mass adds the torque ``3 n × I n`` [Hughes, *Spacecraft Attitude Dynamics*, 1986, 8.1].
         """
-        poses = self.poses(q)
-        origin, n = self.common_centre(poses), direction
-        forces, torques = [], []
-        for body, (link, centre) in enumerate(zip(self.body_links, self.body_centres(poses), strict=True)):
-            R, offset = poses.rotations[link], centre - origin
-            forces.append(self.masses[body] * (3.0 * jnp.dot(n, offset) * n - offset))
-            torques.append(3.0 * jnp.cross(n, R @ (self.inertias[body] @ (R.T @ n))))
+        poses, n = self.poses(q), direction
+        offsets = self.body_centres(poses) - self.common_centre(poses)
+        forces = self.masses[:, None] * (3.0 * (offsets @ n)[:, None] * n - offsets)
+        torques = 3.0 * jnp.cross(n, self.central_inertias(poses) @ n)
         joint_forces, total = self._collect_wrenches(poses, forces, torques)
         return total[:3], joint_forces  # the total force is zero, so the torque is the same about every point
 
-    def _collect_wrenches(self, poses: Poses, forces: list, torques: list) -> tuple[jax.Array, jax.Array]:
+    def _collect_wrenches(self, poses: Poses, forces, torques) -> tuple[jax.Array, jax.Array]:
         """Return the joint forces, shape (k,), and the total wrench, shape (6,), of forces and torques on the bodies.
 
-        Each force acts in the centre of mass of its body. The wrench is (torque about the origin of the base, force).
+        Each force acts in the centre of mass of its body; both have the shape (m, 3). The wrench is (torque about the
+        origin of the base, force).
         """
-        wrenches = [jnp.zeros(6)] * (self.n_joints + 1)
-        for link, centre, force, torque in zip(self.body_links, self.body_centres(poses), forces, torques, strict=True):
-            wrenches[link] = jnp.concatenate([torque + jnp.cross(centre, force), force])
-        joint_forces = [jnp.zeros(())] * self.n_joints
-        for i in reversed(range(self.n_joints)):
-            joint_forces[i] = jnp.dot(poses.screws[i], wrenches[i + 1])
-            wrenches[self.parents[i]] += wrenches[i + 1]
-        return jnp.stack(joint_forces), wrenches[0]
+        wrenches = jnp.concatenate([torques + jnp.cross(self.body_centres(poses), forces), forces], axis=1)
+        sums = self._bodies_beyond @ wrenches
+        return jnp.sum(poses.joint_screws * sums[1:], axis=1), sums[0]
 
 
 class _Elimination(NamedTuple):
-    """One velocity, eliminated from a quadratic function of spatial velocities.
+    """The last velocity, eliminated from the kinetic energy of given momenta.
 
     Attributes
     ----------
-    column : array, shape (6,)
-        U, the articulated inertia times the screw.
+    column : array, shape (j,)
+        Entries of the matrix that couple it with the velocities before it.
     pivot : array, shape ()
-        D, the screw times U.
-    impulse : array, shape ()
-        u, the momentum of the joint less the bias along the screw.
+        Its entry on the diagonal.
+    momentum : array, shape ()
+        Its momentum, less the parts of the velocities behind it.
     """
 
     column: jax.Array
     pivot: jax.Array
-    impulse: jax.Array
-
-    @classmethod
-    def from_inertia(cls, inertia, bias, screw, momentum) -> _Elimination:
-        """Return the elimination of the velocity along a screw that has a given momentum."""
-        column = inertia @ screw
-        return cls(column, jnp.dot(screw, column), momentum - jnp.dot(screw, bias))
-
-    def reduced_inertia(self, inertia) -> jax.Array:
-        """Return the articulated inertia without the eliminated velocity, shape (6, 6)."""
-        return inertia - jnp.outer(self.column, self.column / self.pivot)
-
-    def bias(self, bias) -> jax.Array:
-        """Return the bias that the rest of the tree sees, shape (6,)."""
-        return bias + self.column * (self.impulse / self.pivot)
+    momentum: jax.Array
 
 
-def _eliminate_base(inertia, bias, Pi) -> list[_Elimination]:
-    """Eliminate the velocity of a free base, without linear momentum: the translations first.
+def _eliminate_velocities(H, momenta) -> list[_Elimination]:
+    """Eliminate the velocities v from ``v . H v / 2 - momenta . v``, from the leaves of the tree to the base.
 
-    The column of each step has the entries of the velocities that are eliminated after it.
+    In this order the pivots are those of the articulated-body recursion, and none is the small difference of large
+    numbers because of bodies that lie nearer to the base.
     """
-    A, b = jnp.roll(inertia, 3, axis=(0, 1)), jnp.roll(bias, 3)
     steps: list[_Elimination] = []
-    for momentum in [0.0, 0.0, 0.0, *Pi]:
-        step = _Elimination(A[1:, 0], A[0, 0], momentum - b[0])
+    for last in reversed(range(len(H))):
+        step = _Elimination(H[:last, last], H[last, last], momenta[last])
         steps.append(step)
-        A, b = step.reduced_inertia(A[1:, 1:]), step.bias(b[1:])
+        H = H[:last, :last] - jnp.outer(step.column, step.column / step.pivot)
+        momenta = momenta[:last] - step.column * (step.momentum / step.pivot)
     return steps
 
 
-def _base_velocity(steps: list[_Elimination]) -> jax.Array:
-    """Return the velocity of the base, shape (6,), from the steps of :func:`_eliminate_base`."""
-    V = jnp.zeros(0)
+def _velocities(steps: list[_Elimination]) -> jax.Array:
+    """Return the velocities at which the function of :func:`_eliminate_velocities` is smallest, shape (n,)."""
+    v = jnp.zeros(0)
     for step in reversed(steps):
-        V = jnp.concatenate([((step.impulse - jnp.dot(step.column, V)) / step.pivot)[None], V])
-    return jnp.roll(V, 3)
+        v = jnp.append(v, (step.momentum - jnp.dot(step.column, v)) / step.pivot)
+    return v
 
 
-def _sum_of_squares(joints: list[_Elimination], base: list[_Elimination]) -> jax.Array:
+def _sum_of_squares(steps: list[_Elimination]) -> jax.Array:
     """Return the kinetic energy, a sum of squares: one for each eliminated velocity."""
-    return 0.5 * jnp.sum(jnp.stack([step.impulse**2 / step.pivot for step in [*joints, *base]]))
+    return 0.5 * jnp.sum(jnp.stack([step.momentum**2 / step.pivot for step in steps]))
 
 
-def _cross_matrix(v) -> jax.Array:
-    """Return the matrix of ``v ×``, shape (3, 3)."""
-    zero = jnp.zeros_like(v[0])
-    return jnp.array([[zero, -v[2], v[1]], [v[2], zero, -v[0]], [-v[1], v[0], zero]])
+def _products(matrices, vectors) -> jax.Array:
+    """Return the product of each matrix, shape (n, 3, 3), with its vector, shape (n, 3)."""
+    return jnp.sum(matrices * vectors[:, None, :], axis=2)
 
 
-def _rotation(axis, angle) -> jax.Array:
-    """Return the rotation by an angle about a unit vector, shape (3, 3), by Rodrigues' formula."""
-    s, half = jnp.sin(angle), jnp.sin(0.5 * angle)
+def _rotations(axes, angles) -> jax.Array:
+    """Return the rotations by angles, shape (n,), about unit vectors, shape (n, 3), by Rodrigues' formula."""
+    s, half = jnp.sin(angles)[:, None, None], jnp.sin(0.5 * angles)[:, None, None]
     # 1 - cos as a square, which keeps its digits at small angles
-    return (1.0 - 2.0 * half**2) * jnp.eye(3) + s * _cross_matrix(axis) + 2.0 * half**2 * jnp.outer(axis, axis)
+    outer_products = axes[:, :, None] * axes[:, None, :]
+    return (1.0 - 2.0 * half**2) * jnp.eye(3) + s * _cross_matrices(axes) + 2.0 * half**2 * outer_products
+
+
+def _cross_matrices(v) -> jax.Array:
+    """Return the matrices of ``v ×``, shape (n, 3, 3), of vectors of shape (n, 3)."""
+    return jnp.cross(v[:, None, :], jnp.eye(3)).swapaxes(1, 2)
 
 
 def _motion_cross(V, W) -> jax.Array:
-    """Return the rate of a spatial velocity W that is fixed in a body which moves with V, shape (6,)."""
-    return jnp.concatenate([jnp.cross(V[:3], W[:3]), jnp.cross(V[:3], W[3:]) + jnp.cross(V[3:], W[:3])])
+    """Return the rates of spatial velocities W that are fixed in bodies which move with V, all of shape (n, 6)."""
+    linear = jnp.cross(V[:, :3], W[:, 3:]) + jnp.cross(V[:, 3:], W[:, :3])
+    return jnp.concatenate([jnp.cross(V[:, :3], W[:, :3]), linear], axis=1)
 
 
 class KineticEnergy(Energy):
@@ -451,11 +489,9 @@ def _weight_potential(weight: WeightPotential, x) -> jax.Array:
 @subprogram
 def _weight_rounding_scale(weight: WeightPotential, x) -> jax.Array:
     mechanism, q = weight.mechanism, x[: weight.mechanism.n_joints]
-    lengths = [jnp.zeros(())]
-    for i, (parent, slides) in enumerate(zip(mechanism.parents, mechanism.slides, strict=True)):
-        stroke = jnp.abs(q[i]) if slides else jnp.zeros(())
-        lengths.append(lengths[parent] + jnp.linalg.norm(mechanism.places[i]) + stroke)
-    arms = jnp.stack([lengths[link] for link in mechanism.body_links]) + jnp.linalg.norm(mechanism.centres, axis=1)
+    strokes = jnp.where(np.array(mechanism.slides), jnp.abs(q), 0.0)
+    lengths = mechanism._moved_by @ (jnp.linalg.norm(mechanism.places, axis=1) + strokes)
+    arms = lengths[np.array(mechanism.body_links)] + jnp.linalg.norm(mechanism.centres, axis=1)
     return jnp.linalg.norm(weight.gravity) * jnp.dot(mechanism.masses, arms)
 
 

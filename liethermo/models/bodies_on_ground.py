@@ -15,6 +15,7 @@ from manifolds._pytree_module import replace_fields
 
 from ..errors import InputError
 from ..systems import HeatBaths
+from ..systems.interface import TORQUE_FREE_LAWS, TorqueLaws
 from ..systems.torque import TorqueSystem
 from .articulated_bodies import ArticulatedBodies, JointSprings, WeightPotential
 from .joint_states import (
@@ -70,14 +71,8 @@ class BodiesOnGround(TreeSystem, TorqueSystem):
     # -- the torques of the motors ------------------------------------------------------------------------------------
 
     @property
-    def has_torque(self) -> bool:
-        return self.motors is not None
-
-    @property
-    def torque_name(self) -> str:
-        return "" if self.motors is None else str(self.motors)
-
-    has_impulse = False
+    def torque_laws(self) -> TorqueLaws:
+        return TORQUE_FREE_LAWS if self.motors is None else TorqueLaws(str(self.motors))
 
     def _torque_at(self, x, t, attitude):
         assert self.motors is not None

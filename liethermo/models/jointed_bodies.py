@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -18,6 +19,7 @@ from manifolds.structures.poisson import PoissonStructure, ProductPoisson
 from ..errors import InputError
 from ..functions.energy import Energy, Quadratic
 from ..systems import HeatBaths, LiePoissonSystem
+from ..systems.interface import TorqueLaws
 from ..tracing.programs import jit_unoptimised
 from .articulated_bodies import ArticulatedBodies, JointSprings, KineticEnergy, SquaredMomentum
 from .joint_states import (
@@ -97,22 +99,14 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
     # -- torques of motors and of gravity -----------------------------------------------------------------------------
 
     @property
-    def torque_name(self) -> str:
-        motors = "" if self.motors is None else str(self.motors)
-        gradient = "" if self.orbit is None else "gradient of gravity"
-        return " + ".join(filter(None, [super().torque_name, gradient, motors]))
-
-    @property
-    def has_torque(self) -> bool:
-        return bool(self.torque_name)
-
-    @property
-    def needs_attitude(self) -> bool:
-        return self.orbit is not None or super().needs_attitude
-
-    @property
-    def has_impulse(self) -> bool:
-        return self.orbit is not None or super().has_impulse
+    def torque_laws(self) -> TorqueLaws:
+        laws, motors = super().torque_laws, "" if self.motors is None else str(self.motors)
+        if self.orbit is None:
+            return replace(laws, name=" + ".join(filter(None, [laws.name, motors])))
+        name = " + ".join(filter(None, [laws.name, "gradient of gravity", motors]))
+        return TorqueLaws(
+            name, has_impulse=True, needs_attitude=True, changed_casimirs=frozenset(self.momentum_casimirs())
+        )
 
     def _torque_at(self, x, t, attitude):
         k = self.mechanism.n_joints
@@ -133,12 +127,6 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
     def drop_torque(self):
         system = super().drop_torque()
         return system if system is self else replace_fields(system, motors=None, orbit=None)
-
-    @property
-    def torque_invariant_casimirs(self) -> frozenset[str]:
-        if self.orbit is not None:
-            return frozenset()
-        return frozenset(self.casimirs()) if self.torque is None else super().torque_invariant_casimirs
 
     def casimirs(self) -> dict[str, Energy]:
         kinetic = KineticEnergy(self.mechanism)

@@ -15,7 +15,9 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
+from typing import Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +26,12 @@ import scipy
 import manifolds as mf
 from manifolds.matrices.linear import adjoint
 
+from ..dissipation.base import Dissipation
+from ..dissipation.brackets import DoubleBracket, KillingDissipation
+from ..dissipation.checks import checked_rate
 from ..errors import InputError
+from ..functions.energy import Energy, Quadratic
+from ..systems import LiePoissonSystem
 from .parameters import checked_integer
 
 TRACE_RTOL = 1e-12
@@ -305,3 +312,138 @@ def normalised_associated_legendre(m: int, max_degree: int, theta: np.ndarray) -
         previous_column, new_column = columns[-1], a * (x * columns[-1] - b * previous_column)
         columns.append(new_column)
     return np.stack(columns, axis=1)
+
+
+class KineticEnergy(Energy):
+    """The kinetic energy of a fluid on the sphere times gamma, ``gamma / 2 tr(W^H (-Delta)^{-1} W)``."""
+
+    sphere: QuantisedSphere = eqx.field(static=True)
+
+    is_quadratic = True
+
+    def gradient(self, x) -> jax.Array:
+        psi = self.sphere.inverse_laplacian(x)
+        return -self.sphere.gamma * self.sphere.algebra.matrix_basis.raise_index(psi)
+
+    def value(self, x) -> jax.Array:
+        return 0.5 * jnp.dot(x, self.gradient(x))
+
+
+def zeitlin(N: int, decay: Literal["enstrophy", "energy"] | None = None, rate=0.0) -> LiePoissonSystem:
+    """A two-dimensional ideal fluid on the unit sphere, its vorticity an N by N matrix: the dual of su(N).
+
+    ``W' = gamma [P, W]``, ``Delta P = W``, is ``omega' = -{psi, omega}``, ``Delta psi = omega``, for functions of
+    degree below N, in the time of the fluid. Coordinates, harmonics and pictures are those of
+    :class:`liethermo.models.QuantisedSphere`. All ``tr W^k`` are conserved, as all integrals of powers of vorticity
+    are. The entropy is minus the enstrophy ``integral omega^2 / 2 = tr(W^H W) / 2``, a Casimir. Decay is one of two
+    mirror images:
+
+    "enstrophy"
+        ``W' = gamma [P, W] + rate gamma^2 [P, [P, W]]``: the energy is constant and the enstrophy falls, by
+        ``rate tr|gamma [P, W]|^2``, until ``[P, W] = 0``, where vorticity is a function of the stream function. This is
+        the selective decay of Gay-Balmaz and Holm [2013], and :class:`KillingDissipation` here.
+    "energy"
+        ``W' = gamma [P, W] + rate gamma^2 [W, [P, W]]``: every Casimir is constant and the energy falls, towards the
+        same states [Vallis, Carnevale & Young 1989]; :class:`DoubleBracket` here.
+
+    A step of an explicit method takes O(N^3) operations in products of matrices, and O(N^2) memory.
+
+    Parameters
+    ----------
+    N : int, >= 2
+    decay : {"enstrophy", "energy"}, optional
+        The function that decays; by default none.
+    rate : float, >= 0
+        Rate of the decay, in units of time for "enstrophy" and 1 / time for "energy".
+
+    Returns
+    -------
+    LiePoissonSystem
+        Its energy is gamma times that of the fluid, so that its time is that of the fluid.
+
+    Raises
+    ------
+    InputError
+    manifolds.SizeError
+        If N is so large that a step would not fit into memory.
+
+    Examples
+    --------
+    >>> fluid = lt.models.zeitlin(8, decay="enstrophy", rate=0.1)
+    >>> fluid.dim
+    63
+    """
+    sphere, rate = QuantisedSphere(N), checked_rate(rate)
+    if decay not in (None, "enstrophy", "energy"):
+        raise InputError(f"decay must be 'enstrophy', 'energy' or None, got {decay!r}")
+    dissipation: Dissipation | None = None
+    if decay == "enstrophy":  # -kappa is N on components, 2N on matrices
+        dissipation = KillingDissipation(rate / (2.0 * sphere.N))
+    elif decay == "energy":  # a motion's components of mu are half of those of its matrix
+        dissipation = DoubleBracket(2.0 * sphere.gamma * rate)
+    return LiePoissonSystem(
+        sphere.algebra,
+        KineticEnergy(sphere),
+        Quadratic(np.full(sphere.algebra.dim, -2.0)),
+        dissipation,
+        validate=False,  # the axioms hold by construction, and testing Jacobi would take O(N^6)
+    )
+
+
+class MagneticEnergy(Energy):
+    """Gamma times the energy of flow and magnetic field, ``gamma / 2 (tr W^H (-Delta)^{-1} W + tr B^H (-Delta) B)``."""
+
+    sphere: QuantisedSphere = eqx.field(static=True)
+
+    is_quadratic = True
+
+    def gradient(self, x) -> jax.Array:
+        sphere, n = self.sphere, self.sphere.algebra.dim
+        tables = sphere.algebra.matrix_basis
+        velocity = tables.raise_index(sphere.inverse_laplacian(x[:n]))
+        current = sphere.laplacian(tables.lower_index(x[n:]))
+        return -sphere.gamma * jnp.concatenate([velocity, current])
+
+    def value(self, x) -> jax.Array:
+        return 0.5 * jnp.dot(x, self.gradient(x))
+
+
+def magnetic_fluid(N: int, rate=0.0) -> LiePoissonSystem:
+    """A conducting fluid on the unit sphere, its vorticity W and magnetic potential B N by N matrices.
+
+    ``W' = gamma ([P, W] + [J, B])``, ``B' = gamma [P, B]`` with ``Delta P = W``, ``J = Delta B`` is
+    ``omega' = -{psi, omega} + {theta, Delta theta}``, ``theta' = -{psi, theta}`` for functions of degree below N: the
+    potential theta is carried by the flow, and its field acts on the flow by the force of Lorentz. The system is that
+    of :func:`manifolds.magnetic_extension` of su(N), a state the components of W in the dual of su(N) and those of B
+    in su(N). Conserved are the energy, all ``tr B^k`` and all ``tr W B^k``: the integrals of functions of theta, and
+    of vorticity times these. The first of the latter is the cross helicity.
+
+    With a rate the motion ``(F, G) = (W', B')`` has the friction ``rate gamma ([W, F] + [B, G])`` in W and
+    ``rate gamma [B, F]`` in B, a double bracket: the energy decays, and all these Casimirs are kept, so the flow tends
+    to an equilibrium of less energy with the same integrals of theta.
+
+    Parameters
+    ----------
+    N : int, >= 2
+    rate : float, >= 0
+        Rate of the decay (1 / time).
+
+    Returns
+    -------
+    LiePoissonSystem
+        Its energy is gamma times that of the fluid, so that its time is that of the fluid. States are made by
+        :meth:`QuantisedSphere.magnetic_state`, and taken apart by :meth:`QuantisedSphere.magnetic_fields`.
+
+    Raises
+    ------
+    InputError
+    manifolds.SizeError
+    """
+    sphere, rate = QuantisedSphere(N), checked_rate(rate)
+    algebra = mf.magnetic_extension(sphere.algebra, by_brackets=True)
+    # a concrete zero leaves the double bracket out
+    is_undamped = not isinstance(rate, jax.core.Tracer) and not float(rate)
+    # components of a motion of W are half of those of its matrix, and those of B have twice its dual ones
+    metric = np.repeat([1.0, 0.25], sphere.algebra.dim)
+    dissipation: Dissipation | None = None if is_undamped else DoubleBracket(2.0 * sphere.gamma * rate, metric)
+    return LiePoissonSystem(algebra, MagneticEnergy(sphere), None, dissipation, validate=False)

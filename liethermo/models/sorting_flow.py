@@ -8,8 +8,8 @@ import numpy as np
 
 import manifolds as mf
 
+from ..dissipation.brackets import DoubleBracket
 from ..dissipation.checks import checked_rate
-from ..dissipation.double_bracket import DoubleBracket
 from ..errors import InputError
 from ..functions.energy import Linear
 from ..systems import LiePoissonSystem

@@ -16,15 +16,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._arguments import public_dir
 from manifolds._arrays import is_traced
-from manifolds._names import public_dir
 from manifolds._pytree_module import Module
 
 from ..errors import InputError
 from ..functions.conditions import checked_numbers, require_condition
-from ..functions.piecewise import PiecewiseConstant as FunctionPiecewiseConstant
-from ..functions.piecewise import Table, TableKind, kinks_of_table
-from ..functions.time_span import FunctionWithBreaks
+from ..functions.time_span import FunctionWithBreaks, Table, TableKind, kinks_of_table
+from ..functions.time_span import PiecewiseConstant as FunctionPiecewiseConstant
 from .inertia import checked_inertia
 from .orbits import DipoleField, Orbit, direction_and_distance, unit_vector
 from .parameters import checked_finite, checked_positive

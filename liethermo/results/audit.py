@@ -483,8 +483,8 @@ INEXACT_LAW_NOTE = "not kept exactly by this method"
 """Note of a law that the method does not promise to keep."""
 
 
-def _judged_row(law: str, value: float, tolerance: float, note: str = "") -> AuditRow:
-    return AuditRow(law, float(value), tolerance, bool(value <= tolerance), note)
+def _judged_row(law: str, value: float, tolerance: float) -> AuditRow:
+    return AuditRow(law, float(value), tolerance, bool(value <= tolerance), "")
 
 
 def _inexact_law_note(laws: Laws, law: str) -> str:

@@ -401,7 +401,7 @@ class Ensemble(AuditableResult):
 
     @classmethod
     def from_file(cls, series: dict[str, np.ndarray], attributes: dict[str, Any]) -> Ensemble:
-        """Build an ensemble from the arrays and attributes of a file, as :func:`.files.read_dataset` returns them.
+        """Build an ensemble from the arrays and attributes of a file, as :func:`.netcdf.read_dataset` returns them.
 
         KeyError, TypeError or ValueError if a part is missing or does not fit.
         """
@@ -449,6 +449,3 @@ PER_MEMBER_FIELDS = tuple(
     "largest_energy end_time rejected".split()
 )
 """Fields with one value for each trajectory."""
-
-REQUIRED_FIELDS = ("energy", "x0", *PER_MEMBER_FIELDS)
-"""Fields that every ensemble has."""

@@ -1,4 +1,4 @@
-"""Result of a run: the trajectory, its laws, its status and its provenance."""
+"""Result of a run: the trajectory, also between the ends of its steps, its laws, its status and its provenance."""
 
 from __future__ import annotations
 
@@ -12,15 +12,10 @@ import numpy as np
 from manifolds._precision import with_library_settings
 from manifolds._tables import html_grid
 
-from ..errors import InputError
+from ..errors import ConvergenceError, InputError
 from .audit import Audit, Tolerances, audit_run
 from .audit_evidence import AuditableResult, Evidence, copies_of_velocities
 from .events import Events
-
-if TYPE_CHECKING:
-    import xarray
-
-    from .dense_output import DenseOutput
 from .netcdf import (
     SOLUTION_FORMAT,
     array_of_shape,
@@ -31,8 +26,122 @@ from .netcdf import (
     state_axis_names,
 )
 from .orientation import orientation_variables
-from .sketch import svg_sketch
 from .status import Laws, Stats, Status
+
+
+def _identity(x: np.ndarray) -> np.ndarray:
+    return x
+
+
+@dataclass(frozen=True)
+class DenseOutput:
+    """Dense output ``x(t)``: the end of a step of the method that begins at the last state before t.
+
+    Such states have the order of the method and obey its laws: the energy and the invariants equal those of the state
+    at which the step begins, and the entropy is not smaller.
+
+    Attributes
+    ----------
+    t : ndarray, shape (steps + 1,)
+        Times at which the steps of the run begin, and the end of the last.
+    x : ndarray, shape (steps + 1, n)
+        States at these times.
+    step_ends : function from states, shape (m, n), and step sizes, shape (m,), to states
+        Returns NaN for a step that fails.
+    to_user_state : function from states, shape (m, n), to states
+        Converts internal states to those that the user sees.
+    """
+
+    t: np.ndarray
+    x: np.ndarray
+    step_ends: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    to_user_state: Callable[[np.ndarray], np.ndarray] = _identity
+
+    def __call__(self, t) -> np.ndarray:
+        t = np.asarray(t, dtype=np.float64)
+        start, end = self.t[0], self.t[-1]
+        slack = 1e-12 * (end - start)
+        if not np.all((t >= start - slack) & (t <= end + slack)):
+            raise InputError(f"t must be from {start:g} to {end:g}, the span of the solution, got {t}")
+        times = np.clip(t.ravel(), start, end)
+        i = np.searchsorted(self.t, times, side="right") - 1
+        h, x = times - self.t[i], self.x[i]
+        inside_steps = np.flatnonzero(h > 0.0)
+        if inside_steps.size:
+            x[inside_steps] = self.step_ends(x[inside_steps], h[inside_steps])
+            self._check_solved(times[inside_steps], x[inside_steps])
+        x = self.to_user_state(x)
+        return x.reshape(*t.shape, x.shape[-1])
+
+    def _check_solved(self, t: np.ndarray, x: np.ndarray) -> None:
+        """Raise if a partial step failed, although the run has taken the full step."""
+        is_unknown = np.isnan(x).any(axis=1)
+        if is_unknown.any():
+            raise ConvergenceError(
+                f"the state at t = {t[is_unknown][0]:g}, between two steps, cannot be found: the equations of a "
+                "partial step were not solved. Evaluate the solution at the ends of the steps, or take smaller steps",
+                None,
+            )
+
+    def with_output_map(self, output_map: Callable[[np.ndarray], np.ndarray]) -> DenseOutput:
+        """Return this dense output with ``output_map`` applied to the states that the user sees."""
+        previous_map = self.to_user_state
+        return replace(self, to_user_state=lambda x: np.asarray(output_map(previous_map(x))))
+
+
+MAX_POINTS = 400
+"""Largest number of points of a curve; longer series are thinned."""
+
+MAX_CURVES = 8
+"""Largest number of curves, which is the number of colours."""
+
+SKETCH_SIZE = (280, 110)
+"""Width and height of a sketch in pixels."""
+
+CURVE_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#999999", "#F0E442")
+"""Colours of the curves, which colour-blind readers can tell apart [Okabe & Ito 2008]."""
+
+
+def svg_sketch(t: np.ndarray, series: np.ndarray, label: str) -> str:
+    """Draw curves over time in one frame, with a common scale.
+
+    Parameters
+    ----------
+    t : ndarray, shape (times,)
+    series : ndarray, shape (times, curves)
+        Only the first eight curves are drawn.
+    label : str
+        Description of the picture, in words.
+
+    Returns
+    -------
+    str
+        An ``<svg>`` element.
+    """
+    width, height = SKETCH_SIZE
+    indices = np.unique(np.linspace(0, len(t) - 1, min(len(t), MAX_POINTS)).round().astype(int))
+    t, series = t[indices], series[indices, :MAX_CURVES]
+    finite_values = series[np.isfinite(series)]
+    lower, upper = (finite_values.min(), finite_values.max()) if finite_values.size else (0.0, 1.0)
+    value_range = (upper - lower) or 1.0
+    x_pixels = 4 + (width - 8) * (t - t[0]) / ((t[-1] - t[0]) or 1.0)
+    y_pixels = height - 4 - (height - 8) * (series - lower) / value_range
+    curves = "".join(
+        f'<polyline fill="none" stroke="{colour}" stroke-width="1.3" points="'
+        + " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(x_pixels, column, strict=True) if np.isfinite(y))
+        + '"/>'
+        for colour, column in zip(CURVE_COLOURS, y_pixels.T, strict=False)
+    )
+    frame = f'<rect x="0.5" y="0.5" width="{width - 1}" height="{height - 1}" fill="none" stroke="#888"/>'
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" viewBox="0 0 {width} {height}" '
+        f'role="img" aria-label="{label}">{frame}{curves}</svg>'
+    )
+
+
+if TYPE_CHECKING:
+    import xarray
+
 
 Class = TypeVar("Class", bound=type)
 
@@ -252,7 +361,7 @@ class Solution(AuditableResult):
 
     @classmethod
     def from_file(cls, series: dict[str, np.ndarray], attributes: dict[str, Any]) -> Solution:
-        """Build a solution from the arrays and attributes of a file, as :func:`.files.read_dataset` returns them.
+        """Build a solution from the arrays and attributes of a file, as :func:`.netcdf.read_dataset` returns them.
 
         KeyError, TypeError or ValueError if a part is missing or does not fit.
         """

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ..engines.adaptive_runs import AdaptiveRuns, EventRules, PauseHandler, start_adaptive_runs
-from ..engines.compiled.lanes import CompiledAdaptiveRuns
+from ..engines.compiled.engine import CompiledAdaptiveRuns
 from ..engines.status_codes import StatusCode
 from ..engines.step import REPORTED_FIELDS
 from ..engines.step_control import StepControl

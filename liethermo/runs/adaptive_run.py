@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..engines.adaptive_runs import AdaptiveRuns, EventRules, PauseHandler
+from ..engines.adaptive_steps import ATTEMPT_FIELDS
 from ..engines.select_engine import EngineWithFallback
 from ..engines.status_codes import StatusCode
 from ..engines.step import State
-from ..engines.step_control import ATTEMPT_FIELDS, StepControl
+from ..engines.step_control import StepControl
 from ..tracing.scalarize import UnsupportedPrimitive
 from .driver import drive_adaptive
 from .events import EventSet

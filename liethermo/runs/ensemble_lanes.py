@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 import numpy as np
 
 from ..engines import array_engine
-from ..engines.compiled.lanes import CompiledBatch
+from ..engines.compiled.engine import CompiledBatch
 from ..engines.compiled.parameters import flat_parameters
 from ..engines.compiled.step_loop import cached_step_loop
 from ..engines.select_engine import MAX_COMPILED_DIM

@@ -148,7 +148,7 @@ def common_inertia(family: Family) -> np.ndarray | None:
 
 def members_outside_domain(family: Family, states: np.ndarray) -> list[int]:
     """Return the members whose parameters do not allow their initial states, shape (B, n)."""
-    if family.member(0).domain_margin(jnp.asarray(states[0])) is None:
+    if family.member(0).domain.margin is None:
         return []
     parameters = family.parameter_matrix(slice(None), len(states))
     margins = evaluate_at_points(
@@ -197,8 +197,9 @@ class _MemberFunctions:
         count, member = len(self.casimirs) + len(self.member.preserved), self.member
         verdicts = self._judge_functions(_casimir_and_preserved_rates, count, self.casimirs, use_nearby_states=True)
         # a torque may be zero at the test times only, so no function on which it acts counts as conserved
-        has_torque = [member.torque_name and name not in member.torque_invariant_casimirs for name in self.casimirs]
-        has_torque += [bool(member.torque_name)] * len(member.preserved)
+        torque = member.torque_laws
+        has_torque = [name in torque.changed_casimirs for name in self.casimirs]
+        has_torque += [torque.name != ""] * len(member.preserved)
         return np.where(np.array(has_torque, dtype=bool), VERDICT_NOT_CONSERVED, verdicts)
 
     def verdicts_of_requested_functions(self) -> np.ndarray:
@@ -368,7 +369,7 @@ def _bath_entropy_scales(model, row):
 def _domain_margin(model, row):
     form, p = model
     system, x = _member_and_state(form, p, row)
-    return system.domain_margin(x)
+    return system.domain.margin_at(x)
 
 
 def _inverse_inertia(model, row):

@@ -10,6 +10,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+import scipy
 
 from manifolds._class_members import ListedType
 
@@ -23,7 +24,75 @@ from ..systems import System
 from ..systems.check import AXIOM_TOLERANCE, CheckReport, CheckRow
 from ..tracing.interpret import evaluate_at_points
 from .schedule import StepSchedule
-from .threefry import derive_key, grid_seeds, normal_numbers, split_words
+
+ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
+"""Rotation distances of the rounds, in bits, from the definition of Threefry-2x32."""
+PARITY = np.uint32(0x1BD11BDA)
+"""Parity constant of the key schedule, from the definition of Threefry."""
+
+VALUES_PER_BLOCK = 1 << 15
+"""Number of random numbers generated at once, small enough for the cache."""
+
+
+def threefry(key, counter) -> tuple[np.ndarray, np.ndarray]:
+    """Return two words of 32 random bits for each pair of a key and a counter; keys and counters are pairs of words
+    that broadcast."""
+    words = (*key, PARITY ^ key[0] ^ key[1])
+    x, y = counter[0] + words[0], counter[1] + words[1]
+    for group in range(5):
+        for rotation in ROTATIONS[group % 2]:
+            x = x + y
+            y = (y << np.uint32(rotation) | y >> np.uint32(32 - rotation)) ^ x
+        x, y = x + words[(group + 1) % 3], y + words[(group + 2) % 3] + np.uint32(group + 1)
+    return x, y
+
+
+def grid_seeds(seed: int, grid_indices: Sequence[np.ndarray]) -> np.ndarray:
+    """Return a seed below 2^63 for each grid point, from one seed and the indices along each axis, shape (points,)."""
+    count = len(grid_indices[0]) if grid_indices else 1
+    key = np.full(count, seed >> 32, np.uint32), np.full(count, seed & 0xFFFFFFFF, np.uint32)
+    for axis, axis_indices in enumerate(grid_indices):
+        key = threefry(key, (np.asarray(axis_indices).astype(np.uint32), np.full(count, axis, np.uint32)))
+    return (key[0].astype(np.int64) & 0x7FFFFFFF) << 32 | key[1].astype(np.int64)
+
+
+def derive_key(key, *counters) -> tuple[np.ndarray, np.ndarray]:
+    """Return the key derived from ``key`` by a chain of counters, each encrypted with the key derived so far."""
+    for counter in counters:
+        key = threefry(key, tuple(np.asarray(word).astype(np.uint32) for word in counter))
+    return key
+
+
+def split_words(numbers) -> tuple[np.ndarray, np.ndarray]:
+    """Return the high and low 32 bits of 64-bit integers, negative ones in two's complement."""
+    numbers = np.asarray(numbers).astype(np.int64).view(np.uint64)
+    return (numbers >> np.uint64(32)).astype(np.uint32), numbers.astype(np.uint32)
+
+
+def normal_numbers(key, steps: np.ndarray, count: int) -> np.ndarray:
+    """Return normal random numbers for each key and step, shape (keys, steps, count).
+
+    Parameters
+    ----------
+    key : two arrays of uint32, shape (keys,)
+    steps : array of uint32, shape (steps,)
+        The counters of the steps.
+    count : int
+        Normal numbers of a step.
+    """
+    numbers = np.empty((len(key[0]), len(steps), count))
+    value_indices = np.arange(count, dtype=np.uint32)
+    steps_per_block = max(1, VALUES_PER_BLOCK // max(count, 1))
+    keys_per_block = max(1, steps_per_block // max(len(steps), 1))
+    for i in range(0, len(numbers), keys_per_block):
+        keys = key[0][i : i + keys_per_block, None, None], key[1][i : i + keys_per_block, None, None]
+        for start in range(0, len(steps), steps_per_block):
+            high_words, low_words = threefry(keys, (steps[start : start + steps_per_block, None], value_indices))
+            bits = high_words.astype(np.uint64) << np.uint64(32) | low_words
+            values = scipy.special.ndtri(((bits >> np.uint64(11)) + 0.5) * 2.0**-53)
+            numbers[i : i + keys_per_block, start : start + steps_per_block] = values
+    return numbers
+
 
 MAX_STANDARD_DEVIATIONS = 6.0
 """Largest absolute value of a normal random number, so that the equation of a step keeps a solution. One number in 5e8
@@ -239,7 +308,6 @@ MEASURE_ROW = "the motion keeps the measure"
 
 def _noise_residuals(model: tuple[System, Energy | None], x):
     system, density = model
-    assert system.dissipation is not None
 
     def motion(y):
         return system.poisson.sharp(y, system.energy.gradient(y))
@@ -249,7 +317,7 @@ def _noise_residuals(model: tuple[System, Energy | None], x):
         terms = jnp.append(terms, jnp.dot(density.gradient(x), motion(x)))
     scale = jnp.max(jnp.abs(terms)) + jnp.max(jnp.abs(motion(x))) / (1.0 + jnp.max(jnp.abs(x)))
     measure_residual = {MEASURE_ROW: jnp.abs(jnp.sum(terms)) / jnp.where(scale > 0.0, scale, 1.0)}
-    return factor_check_residuals(system.dissipation, system, x) | measure_residual
+    return factor_check_residuals(system.total_dissipation, system, x) | measure_residual
 
 
 @dataclass(frozen=True)

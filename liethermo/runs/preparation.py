@@ -130,9 +130,9 @@ def prepare_system_and_method(
     if not isinstance(method, OneStepMethod):
         if noise is not None:
             raise InputError(f"noise= works only with lt.MetriplecticMidpoint, got {method}")
-        if system.needs_attitude:
+        if system.torque_laws.needs_attitude:
             raise InputError(
-                f"the torque {system.torque_name} depends on the attitude, which {method} cannot integrate. Use a "
+                f"the torque {system.torque_laws.name} depends on the attitude, which {method} cannot integrate. Use a "
                 "method of the library, such as lt.MetriplecticGauss()"
             )
         return make_autonomous(system, unit=1.0), method  # its errors are measured component by component
@@ -150,7 +150,7 @@ def prepare_for_method(
         pullback_method(method, autonomous_system).on(autonomous_system, tolerance), autonomous_system.dim
     )
     reconstruction = system.reconstruction if isinstance(system, LiePoissonSystem) else None
-    if reconstruction is None or not (attitude or system.needs_attitude):
+    if reconstruction is None or not (attitude or system.torque_laws.needs_attitude):
         return autonomous_system, method
     assert isinstance(autonomous_system, LiePoissonSystem | DrivenSystem)
     kind = "exp" if method.explicit else reconstruction
@@ -189,7 +189,8 @@ def checked_initial_state(system: System, method, x0, t: float, attitude=None) -
 def why_not_startable(system: System, method, x) -> str:
     """Return why no run can start at x, a state or a batch of states; "" if it can."""
     ignores_singularity = has_generator(system) and (not isinstance(method, OneStepMethod) or method.explicit)
-    reason = system.outside(x) or ("" if ignores_singularity else system.why_singular(x))
+    domain = system.domain
+    reason = domain.why_outside(x) or ("" if ignores_singularity else domain.why_singular(x))
     return reason and f"the run cannot start at this x0: {reason}"
 
 

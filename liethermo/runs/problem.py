@@ -12,7 +12,6 @@ import numpy as np
 from ..engines.select_engine import MIN_STEPS_TO_COMPILE, EngineWithFallback
 from ..integrators import OneStepMethod, Reference
 from ..systems import AttitudeSystem, System
-from ..systems.interface import SystemInterface
 from ..tracing.caching import memoize
 from .noise import Fluctuations
 from .preparation import (
@@ -57,11 +56,7 @@ class Problem:
         self._engines = _ThreadEngines()
         self.state_shape = system.shape if system.sites else (system.dim,)
         kind = type(system)
-        self.has_fixed_domain = (
-            system.space is None
-            and kind.outside is SystemInterface.outside
-            and kind.why_singular is SystemInterface.why_singular
-        )
+        self.has_fixed_domain = system.space is None and system.domain.allows_every_start
         self.starts_anywhere = (
             self.has_fixed_domain
             and not self.is_driven

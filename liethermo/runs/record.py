@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..engines.adaptive_runs import EventOccurrence
-from ..engines.compiled.parameters import ProgramStructure
 from ..engines.select_engine import EngineWithFallback
 from ..engines.status_codes import StatusCode
 from ..engines.step import energy_or_entropy_that_relaxes
@@ -24,7 +23,6 @@ from ..results.audit_evidence import (
     SMALLEST_NORMAL,
     Evidence,
     column_maxima,
-    energy_and_entropy,
     evenly_spaced_indices,
     largest_and_evenly_spaced,
     largest_drifts,
@@ -56,7 +54,7 @@ from .solution_builder import (
     series_of_functions,
     velocities_at_states,
 )
-from .system_family import Family
+from .system_family import Family, member_rounding_scales, vector_fields_of_members
 from .termination import ensemble_failure_message
 
 RECORDED_QUANTITIES = (
@@ -387,7 +385,7 @@ class GroupRecord:
             return
         member_indices = np.arange(len(self.x0))[members][failed_rows]
         parameters = self.family.select(member_indices).parameter_matrix(slice(None), len(member_indices))
-        velocities = _vector_fields(
+        velocities = vector_fields_of_members(
             (self.family.form, parameters.shape[1]), np.concatenate([parameters, x[failed_rows]], axis=1)
         )
         for i, j, velocity in zip(failed_rows, member_indices, velocities, strict=True):
@@ -495,7 +493,7 @@ class EnsembleEvidenceCollector:
                 parameters[member_of_step[step_indices], None], (*x.shape[:2], parameters.shape[1])
             )
             rows = np.concatenate([step_parameters, x], axis=2).reshape(-1, parameters.shape[1] + x.shape[2])
-            return _vector_fields(model, rows).reshape(x.shape)
+            return vector_fields_of_members(model, rows).reshape(x.shape)
 
         worst_indices, defect = select_worst_steps(
             steps, field, min_motion[member_of_step], n_replayed_steps(self.x.shape[1])
@@ -554,7 +552,9 @@ class EnsembleEvidenceCollector:
     def _rounding_scales(self, parameters: np.ndarray) -> dict[str, float]:
         """Return the sizes that set the rounding errors of energy and entropy, each the largest over the sample."""
         rows = np.concatenate([parameters, self.x], axis=1)
-        max_scales = evaluate_at_points(_rounding_scales_at, (self.family.form, parameters.shape[1]), rows).max(axis=0)
+        max_scales = evaluate_at_points(member_rounding_scales, (self.family.form, parameters.shape[1]), rows).max(
+            axis=0
+        )
         return {
             name: float(scale) for name, scale in zip(("energy", "entropy"), np.nan_to_num(max_scales), strict=False)
         }
@@ -592,19 +592,3 @@ def common_laws(laws_of_groups: Sequence[Laws]) -> Laws:
         unpromised=tuple(name for name in names if name not in promised),
         unknown=tuple(dict.fromkeys(name for laws in laws_of_groups for name in laws.unknown)),
     )
-
-
-def _rounding_scales_at(model: tuple[ProgramStructure, int], row):
-    form, p = model
-    return rounding_scales(energy_and_entropy(form.build(row[:p])), row[p:])[1]
-
-
-def _vector_fields(model: tuple[ProgramStructure, int], rows: np.ndarray) -> np.ndarray:
-    """Return vector fields, shape (m, n), from rows of parameters and states, shape (m, p + n)."""
-    with np.errstate(all="ignore"):
-        return np.asarray(evaluate_at_points(_vector_field, model, rows))
-
-
-def _vector_field(model: tuple[ProgramStructure, int], row):
-    form, p = model
-    return form.build(row[:p]).vector_field(row[p:])

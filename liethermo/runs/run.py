@@ -21,9 +21,8 @@ from ..engines.step import SavedStates, State, energy_and_entropy_at, start_step
 from ..errors import FileError
 from ..integrators import Reference
 from ..integrators.fluctuating import noise_dimension
-from ..results.dense_output import DenseOutput
 from ..results.events import Events
-from ..results.solution import Solution, defer
+from ..results.solution import DenseOutput, Solution, defer
 from ..results.status import Stats, Status
 from ..systems import System
 from ..systems.clock import system_of_step

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..dissipation.base import dissipation_name
 from ..engines.select_engine import EngineWithFallback
 from ..engines.status_codes import StatusCode
 from ..functions.energy import Energy
@@ -161,8 +162,8 @@ def run_provenance(
         "algebra": None if algebra is None else algebra.name,
         "group": None if group is None else group.name,
         "inertia": None if inertia is None else inertia.tolist(),
-        "dissipation": None if system.dissipation is None else type(system.dissipation).__name__,
-        **({"torque": system.torque_name} if system.torque_name else {}),
+        "dissipation": dissipation_name(system.dissipation),
+        **({"torque": system.torque_laws.name} if system.torque_laws.name else {}),
         **({"joints": {name: [start, end] for name, start, end in system.joint_ranges}} if system.joint_ranges else {}),
         **entries,
     }

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.integrate
@@ -18,6 +17,7 @@ from ..errors import ConvergenceError, InputError
 from ..integrators import OneStepMethod
 from ..results.solution import Solution
 from ..systems import System
+from ..systems.invariants import stack_gradients
 from ..systems.linearisation import conserved_functions, counter_components
 from ..tracing.interpret import evaluate_at_points
 from .propagator import Propagator
@@ -176,7 +176,7 @@ def steady_cycle(
     functions = tuple(f for name, f in conserved_functions(frozen, x).items() if name != "energy")
     gradients = np.zeros((0, len(use)))
     if functions:
-        gradients = evaluate_at_points(_gradients, functions, x[None])[0][:, use]
+        gradients = evaluate_at_points(stack_gradients, functions, x[None])[0][:, use]
     tangents = scipy.linalg.null_space(gradients) if len(gradients) else np.eye(len(use))
     scale, distances = float(np.linalg.norm(x[use])) or 1.0, list[float]()
     while len(distances) < MAX_NEWTON_STEPS:
@@ -269,7 +269,3 @@ class _PeriodMap(NamedTuple):
         displacements = DIFFERENCE_STEP * (samples - y)
         changes = np.stack([self(y + d) - end for d in displacements])
         return np.linalg.lstsq(displacements, changes, rcond=None)[0].T
-
-
-def _gradients(functions, x) -> jax.Array:
-    return jnp.stack([f.gradient(x) for f in functions])

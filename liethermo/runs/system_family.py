@@ -16,8 +16,10 @@ from manifolds import ManifoldsError
 from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
 from ..errors import InputError, LiethermoError
 from ..models.inertia import are_inertia_tensors
+from ..results.audit_evidence import energy_and_entropy, rounding_scales
 from ..systems import System
 from ..tracing.caching import fingerprint
+from ..tracing.interpret import evaluate_at_points
 from ..tracing.traced import TracedFunction, trace_function
 from .named_parameters import arrays_with_members, find_parameter
 
@@ -344,3 +346,20 @@ def error_message_of(call: Callable[[], Any]) -> str:
     except (LiethermoError, ManifoldsError, ValueError, ArithmeticError) as error:
         return str(error) or type(error).__name__
     return ""
+
+
+def member_rounding_scales(model: tuple[ProgramStructure, int], row) -> jax.Array:
+    """Return the rounding scales of energy and entropy, from a row of p parameters and a state."""
+    form, p = model
+    return rounding_scales(energy_and_entropy(form.build(row[:p])), row[p:])[1]
+
+
+def vector_fields_of_members(model: tuple[ProgramStructure, int], rows: np.ndarray) -> np.ndarray:
+    """Return vector fields, shape (m, n), from rows of p parameters and a state, shape (m, p + n)."""
+    with np.errstate(all="ignore"):
+        return np.asarray(evaluate_at_points(_member_vector_field, model, rows))
+
+
+def _member_vector_field(model: tuple[ProgramStructure, int], row):
+    form, p = model
+    return form.build(row[:p]).vector_field(row[p:])

@@ -252,7 +252,9 @@ def final_status(engine: EngineWithFallback, state, t: float, h: float, interrup
             + _step_size_advice(engine, state, h)
         )
         return Status(StatusCode.NOT_CONVERGED, message, step, t, residual)
-    if engine.system.surface is not None and (reason := engine.system.outside(_predicted_state(engine, state, h))):
+    if engine.system.surface is not None and (
+        reason := engine.system.domain.why_outside(_predicted_state(engine, state, h))
+    ):
         text = f"{step_text}, could not be taken: {reason}. Try a smaller step, where the motion itself stays inside"
         return Status(StatusCode.NON_FINITE, text, step, t, residual)
     message = (
@@ -293,7 +295,7 @@ def _why_non_finite(engine: EngineWithFallback, state, h: float) -> str:
     """Return in words which function is not finite at the predicted end of the failed step."""
     system = engine.system
     predicted_state = _predicted_state(engine, state, h)
-    if reason := system.outside(predicted_state):
+    if reason := system.domain.why_outside(predicted_state):
         return reason
     if reason := engine.method.why_step_failed(system, state.x, state.k, h):
         return reason
@@ -304,4 +306,5 @@ def _why_non_finite(engine: EngineWithFallback, state, h: float) -> str:
         if not bool(jnp.isfinite(jnp.asarray(function(predicted_state))).all()):
             state_text = np.array2string(np.asarray(system.user_state(predicted_state)), precision=4, threshold=8)
             return f"the {name} first, near x = {state_text}"
-    return f"the iteration overflowed{system.domain and f', or did not find {system.domain}'}"
+    condition = system.domain.description
+    return f"the iteration overflowed{condition and f', or did not find {condition}'}"

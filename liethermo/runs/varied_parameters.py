@@ -12,8 +12,8 @@ import numpy as np
 from manifolds._arrays import is_traced
 from manifolds._pytree_module import replace_fields
 
+from ..engines.compiled.machine_code import PointEvaluator
 from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
-from ..engines.compiled.point_evaluator import PointEvaluator
 from ..errors import LiethermoError
 from ..systems import System
 from ..systems.conservation import AXIOM_TOLERANCE, judge_conservation, rates_of_change

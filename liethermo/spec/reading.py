@@ -1,27 +1,148 @@
-"""Reading of a spec file, validated completely before anything is computed."""
+"""Reading of a spec file and of its section ``[study]``, validated completely before anything is computed."""
 
 from __future__ import annotations
 
+import copy
 import inspect
 import json
 import os
 import re
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, Literal, NotRequired, Required, Union, get_args, get_origin, get_type_hints
+
+import jax.numpy as jnp
+import numpy as np
+from pydantic import ConfigDict, TypeAdapter, ValidationError, with_config
+from typing_extensions import TypedDict
 
 from .. import disk, models
 from ..errors import AxiomError, InputError, SpecError
 from ..integrators import DEFAULT_METHOD, METHODS
 from ..runs.adaptive import Adaptive
 from ..runs.events import Relaxed
+from ..studies.axes import Zipped, latin_hypercube, sobol, zipped
+from ..studies.measures import At
+from ..studies.study import Study
 from ..systems import System
-from .checking import validate_arguments, validate_table
-from .messages import describe_exception, format_table, format_value, suggest_match
-from .schema import SECTIONS, AdaptiveStep, Method, Model, Outputs, Run, SpecContents, StudySection
+from .schema import (
+    SECTIONS,
+    AdaptiveStep,
+    EvenlySpacedAxis,
+    MeasureTable,
+    Method,
+    Model,
+    Outputs,
+    Run,
+    SampledAxis,
+    SpecContents,
+    StudySection,
+    describe_exception,
+    format_table,
+    format_value,
+    suggest_match,
+)
 from .trust import import_function
+
+SCHEMA_BY_TAG: dict[str, type] = {
+    "table": AdaptiveStep,
+    "points": EvenlySpacedAxis,
+    "sample": SampledAxis,
+    "measure": MeasureTable,
+}
+"""Schema of each table alternative of a key, by its tag."""
+
+MAX_REPORTED_FAULTS = 100
+"""Maximum number of faults of a section that are listed; the others are counted."""
+
+
+def validate_table(key: str, schema: type, table, problems: list[str], reader_name: str) -> Any:
+    """Return the table converted to the types of the schema, or None after appending its faults to ``problems``."""
+    try:
+        return TypeAdapter(schema).validate_json(json.dumps(table), strict=True)
+    except ValidationError as error:
+        faults = error.errors()
+        problems += [_describe_fault(key, fault, schema, reader_name) for fault in faults[:MAX_REPORTED_FAULTS]]
+        problems += [f"{key or 'the file'} has {len(faults) - MAX_REPORTED_FAULTS} faults more"] * (
+            len(faults) > MAX_REPORTED_FAULTS
+        )
+        return None
+
+
+def _describe_fault(key: str, fault: Mapping[str, Any], schema: type, consumer: str) -> str:
+    """Return an error of pydantic as a sentence that begins with the key."""
+    name = ".".join(filter(None, [key, *(str(part) for part in _untagged_location(fault["loc"]))]))
+    name = re.sub(r"\.(\d+)\b", r"[\1]", name)
+    if fault["type"] == "extra_forbidden":
+        keys = _allowed_keys(schema, fault["loc"])
+        return (
+            f"{name}: no such key{suggest_match(fault['loc'][-1], keys)}; {consumer} takes {', '.join(keys) or 'none'}"
+        )
+    if fault["type"] == "missing":
+        field = getattr(schema, "model_fields", {}).get(fault["loc"][-1])
+        return f"{name} is missing" + (f": {field.description}" if field else f"; {consumer} needs it")
+    if fault["type"] in ("model_type", "dict_type"):
+        return f"{name} = {format_value(fault['input'])}: must be a section [{name}]"
+    message = re.sub(r"^Input should|^(List|Tuple) should", "must", fault["msg"])
+    return f"{name} = {format_value(fault['input'])}: {message}"
+
+
+UNION_TAG_NAMES = ("number", "table", "list", "points", "sample", "word", "measure")
+"""Tags of the alternatives of a key, which pydantic inserts into the locations of its errors."""
+
+
+def _untagged_location(parts: tuple) -> list:
+    """Return the location of an error without the tags of alternatives, which may follow any key but the first."""
+    return [part for i, part in enumerate(parts) if i == 0 or part not in UNION_TAG_NAMES]
+
+
+def _allowed_keys(schema: type, location: tuple) -> list[str]:
+    """Return the keys allowed in the table at which an unknown key was found."""
+    for part in location[:-1]:
+        if isinstance(part, str) and part in SCHEMA_BY_TAG:
+            schema = SCHEMA_BY_TAG[part]
+        elif (field := getattr(schema, "model_fields", {}).get(part)) is not None:
+            nested_models = [
+                kind for kind in (field.annotation, *get_args(field.annotation)) if hasattr(kind, "model_fields")
+            ]
+            schema = nested_models[0] if nested_models else schema
+    return list(getattr(schema, "model_fields", None) or schema.__annotations__)
+
+
+def validate_arguments(key: str, function: Callable, table: dict, problems: list[str]) -> dict[str, Any] | None:
+    """Return the table as keyword arguments of a function, validated by its signature and annotations."""
+    try:
+        hints = get_type_hints(function.__init__ if inspect.isclass(function) else function)
+    except Exception:  # annotations with names that exist only for type checkers
+        hints = {}
+    fields: dict[str, Any] = {}
+    extra: Literal["allow", "forbid"] = "forbid"
+    for name, parameter in inspect.signature(function).parameters.items():
+        if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
+            requirement = Required if parameter.default is parameter.empty else NotRequired
+            fields[name] = requirement[_toml_value_type(hints.get(name, Any))]
+        elif parameter.kind is parameter.VAR_KEYWORD:
+            extra = "allow"
+    name = getattr(function, "__name__", "the function")
+    schema = with_config(ConfigDict(extra=extra))(TypedDict(name, fields))  # type: ignore[operator]
+    return validate_table(key, schema, table, problems, name)
+
+
+def _toml_value_type(hint) -> Any:
+    """Return the alternative of a type hint that a TOML value can have; Any if there is not exactly one."""
+    if get_origin(hint) in (Union, UnionType):
+        alternatives = [part for part in get_args(hint) if part is not NoneType and _is_toml_value_type(part)]
+        return alternatives[0] if len(alternatives) == 1 else Any
+    return hint if _is_toml_value_type(hint) else Any
+
+
+def _is_toml_value_type(hint) -> bool:
+    if get_origin(hint) in (list, tuple, Sequence, dict, Mapping):
+        return all(part is Ellipsis or _is_toml_value_type(part) for part in get_args(hint))
+    return get_origin(hint) is Literal or hint in (bool, int, float, str, list, tuple, dict, Any)
 
 
 @dataclass(frozen=True)
@@ -252,3 +373,163 @@ def _build_method(method: Method, problems: list[str]):
         hints = [suggest_match(value, allowed_words) for value in options.values() if isinstance(value, str)]
         problems.append(f"{format_table('method', options)}: {error}{''.join(hints)}")
         return None
+
+
+INITIAL_STATE_KEY = "initial"
+"""Name of the initial state among the parameters that an axis can vary."""
+
+
+@dataclass(frozen=True)
+class PointBuilder:
+    """Picklable function of the parameters of a point: it calls ``build`` with a table in which these are set."""
+
+    build: Callable[..., Any]
+    table: Mapping[str, Any]
+    varied_names: tuple[str, ...]
+
+    def __call__(self, point: Mapping[str, Any]) -> Any:
+        table = copy.deepcopy(dict(self.table))
+        for name in self.varied_names:
+            _set_entry(table, name, point[name])
+        return self.build(**table)
+
+
+def _initial_state(initial: Sequence[Any]) -> jnp.ndarray:
+    """Return the initial state, shape (n,), some of whose entries may be traced."""
+    return jnp.stack([jnp.asarray(value, dtype=jnp.float64) for value in initial])
+
+
+def _set_entry(table: dict[str, Any], name: str, value: Any) -> None:
+    """Set ``rate`` or an entry such as ``inertia[0]`` in a table, copying the lists on the way."""
+    key, *index = _parse_entry_name(name)
+    if not index:
+        table[key] = value
+        return
+    container = table[key] = list(table[key])
+    for i in index[:-1]:
+        container[i] = list(container[i])
+        container = container[i]
+    container[index[-1]] = value
+
+
+def _parse_entry_name(name: str) -> list[Any]:
+    key, *index = re.split(r"[\[\]]+", name.rstrip("]")) if "[" in name else [name]
+    return [key, *map(int, index)]
+
+
+def build_study(spec: Spec, store: str | os.PathLike) -> Study:
+    """Return the study that a spec file describes.
+
+    Raises
+    ------
+    SpecError
+        With all faults of the section.
+    """
+    section = spec.study
+    if section is None:
+        raise SpecError(spec.path, ["study is missing: a section [study] with axes"])
+    problems: list[str] = []
+    axes = {name: _parse_axis(f"study.axes.{name}", axis, problems) for name, axis in section.axes.items()}
+    measures = {
+        name: _parse_measure(f"study.measure.{name}", measure, problems) for name, measure in section.measure.items()
+    }
+    names = [
+        name
+        for axis, values in axes.items()
+        for name in (values.columns if isinstance(values, Zipped) and values.columns else [axis])
+    ]
+    for name in names:
+        _report_if_not_settable(name, spec, problems)
+    if problems:
+        raise SpecError(spec.path, problems)
+    parameter_names, state_names = (
+        [n for n in names if (_parse_entry_name(n)[0] == INITIAL_STATE_KEY) == initial] for initial in (False, True)
+    )
+    initial = list(spec.run.initial)
+    entries = {
+        _parse_entry_name(name)[0] for name in parameter_names if "[" in name
+    }  # defaults of the model that only an axis mentions
+    parameters = {**{name: spec.model_arguments[name] for name in entries}, **spec.parameters}
+    try:
+        return Study(
+            PointBuilder(spec.build, parameters, tuple(parameter_names)),
+            axes,
+            x0=PointBuilder(_initial_state, {INITIAL_STATE_KEY: initial}, tuple(state_names))
+            if state_names
+            else np.array(initial),
+            t_span=spec.run.t_span,
+            step=spec.step,
+            method=spec.method,
+            measure=measures,
+            store=store,
+            until=spec.until,
+            attitude=None if spec.run.attitude is None else np.array(spec.run.attitude),
+            chunk=section.chunk,
+            units=section.units,
+            names=section.names,
+            spec=spec.table,
+        )
+    except InputError as error:
+        raise SpecError(spec.path, [f"study: {error}"]) from error
+
+
+def _parse_axis(key: str, axis: Any, problems: list[str]) -> Any:
+    """Return an axis as an argument of :class:`Study`, or None after appending a fault to ``problems``."""
+    try:
+        if isinstance(axis, EvenlySpacedAxis):
+            grid_function = np.geomspace if axis.scale == "log" else np.linspace
+            if axis.scale == "log" and min(axis.first, axis.last) <= 0.0:
+                raise InputError("the values of a logarithmic axis are positive")
+            return grid_function(axis.first, axis.last, axis.points)
+        if not isinstance(axis, SampledAxis):
+            return axis
+        sample_kinds = [name for name in ("zip", "latin_hypercube", "sobol") if getattr(axis, name) is not None]
+        if len(sample_kinds) != 1:
+            raise InputError("must have one of zip, latin_hypercube and sobol, or first, last and points")
+        if axis.zip is not None:
+            return zipped(**axis.zip)
+        sampler = sobol if axis.sobol is not None else latin_hypercube
+        return sampler(getattr(axis, sample_kinds[0]), seed=axis.seed, **(axis.ranges or {}))
+    except InputError as error:
+        problems.append(f"{key}: {error}")
+        return None
+
+
+def _parse_measure(key: str, measure: Any, problems: list[str]) -> Any:
+    """Return a measure as an argument of :class:`Study`, or None after appending a fault to ``problems``."""
+    if not isinstance(measure, MeasureTable):
+        return measure
+    if (measure.relaxed is None) == (measure.at is None):
+        problems.append(f"{key}: must have one of relaxed and at")
+        return None
+    try:
+        return Relaxed(measure.relaxed) if measure.relaxed is not None else At(measure.at, measure.what)
+    except InputError as error:
+        problems.append(f"{key}: {error}")
+        return None
+
+
+def _report_if_not_settable(name: str, plan: Spec, problems: list[str]) -> None:
+    """Append a fault to ``problems`` unless an axis can vary the parameter of this name."""
+    if not re.fullmatch(r"\w+(\[\d{1,9}\])*", name):
+        problems.append(
+            f"study.axes: {format_value(name)} must be the name of a parameter, or an entry such as inertia[0]"
+        )
+        return
+    key, *index = _parse_entry_name(name)
+    arguments = {**plan.model_arguments, INITIAL_STATE_KEY: list(plan.run.initial)}
+    if key not in arguments:
+        options = [*arguments]
+        hint = suggest_match(key, options)
+        problems.append(f"study.axes: {plan.model_name} has no parameter {key}{hint}; it has {', '.join(options)}")
+        return
+    value = arguments[key]
+    for i in index:
+        if not isinstance(value, list | tuple) or i >= len(value):
+            problems.append(f"study.axes: {name} is not an entry of {key} = {format_value(arguments[key])}")
+            return
+        value = value[i]
+    if isinstance(value, list | tuple):
+        problems.append(
+            f"study.axes: {name} = {format_value(value)} is a list; an axis is one entry of it, such as {name}[0]"
+        )

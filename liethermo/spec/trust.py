@@ -18,7 +18,7 @@ from types import ModuleType
 from typing import Any
 
 from ..errors import InputError
-from .messages import suggest_match
+from .schema import suggest_match
 
 
 def import_function(

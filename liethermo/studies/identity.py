@@ -102,7 +102,7 @@ def study_differences(description: Mapping[str, Any], stored_description: Mappin
 def _system_at_time(system: Any, t: float) -> Any:
     """Return the system with its energy and torque evaluated at time t, and at the identity attitude if one is
     needed."""
-    return system.at_time(t, system.group.identity) if system.needs_attitude else system.at_time(t)
+    return system.at_time(t, system.group.identity) if system.torque_laws.needs_attitude else system.at_time(t)
 
 
 def _value_difference_text(label: str, numbers: list, stored_values: list) -> str:

@@ -17,6 +17,7 @@ from ..results.ensemble import Ensemble
 from ..results.status import Laws
 from ..runs.ensemble import ensemble
 from ..runs.noise import Fluctuations
+from ..runs.system_family import member_rounding_scales
 from ..systems import System
 from ..systems.rotations import attitude_array
 from ..tracing.caching import LRUCache
@@ -316,7 +317,7 @@ class PointSolver:
         else:
             p = family.parameter_matrix(slice(None), len(x0s))[indices]
             magnitudes = evaluate_at_points(
-                _member_rounding_scales, (family.form, p.shape[1]), np.concatenate([p, x], axis=1)
+                member_rounding_scales, (family.form, p.shape[1]), np.concatenate([p, x], axis=1)
             )
         return {
             name: np.nan_to_num(magnitudes[:, k]) for k, name in enumerate(("energy", "entropy")[: magnitudes.shape[1]])
@@ -330,13 +331,6 @@ def _align_axes(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def _system_rounding_scales(system: System, x):
     return rounding_scales(energy_and_entropy(system), x)[1]
-
-
-def _member_rounding_scales(form_and_parameter_count, parameters_and_state):
-    form, n_parameters = form_and_parameter_count
-    return rounding_scales(
-        energy_and_entropy(form.build(parameters_and_state[:n_parameters])), parameters_and_state[n_parameters:]
-    )[1]
 
 
 def describe_error(error: Exception) -> str:

@@ -22,7 +22,7 @@ import numpy as np
 
 from .. import disk
 from ..errors import FileError, InputError
-from . import files
+from . import store_metadata
 from .axes import Axes, Axis
 from .solve import EMPTY_POINT_STATUS, LAW_QUANTITIES, STATUSES, SUCCESS_CODES
 from .store_metadata import (
@@ -135,7 +135,7 @@ class StudyStore:
             raise FileError(f"there is no store {root!s:.200}")
         kind = "folder" if root.is_dir() else "file"
         try:
-            content = json.loads(files.read_plain_file(root / "zarr.json"))
+            content = json.loads(store_metadata.read_plain_file(root / "zarr.json"))
             assert content["attributes"]["format"] == STORE_FORMAT
         except (FileError, ValueError, KeyError, TypeError, AssertionError, RecursionError) as error:
             raise FileError(f"{root} is a {kind}, but not the store of a study; take another name") from error
@@ -143,7 +143,7 @@ class StudyStore:
             store = cls(root, *parse_group_metadata(root, content))
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise FileError(f"{root} is the store of a study, but damaged or changed: {error}") from error
-        files.require_plain_files(root)
+        store_metadata.require_plain_files(root)
         return store
 
     @property
@@ -200,7 +200,7 @@ class StudyStore:
         }
         contents = {f"{name}/zarr.json": content for name, content in metadata.items()}
         for path, content in {**contents, "zarr.json": with_checksum(group)}.items():
-            files.write_file(self.root / path, json.dumps(content, indent=1, allow_nan=False).encode())
+            store_metadata.write_file(self.root / path, json.dumps(content, indent=1, allow_nan=False).encode())
 
     def read_axes(self) -> Axes:
         """Return the axes of the store with their values."""
@@ -282,7 +282,7 @@ class StudyStore:
         if not os.path.lexists(path):
             return None
         try:
-            block = self.arrays[name].decode_chunk(files.read_plain_file(path))
+            block = self.arrays[name].decode_chunk(store_metadata.read_plain_file(path))
             if name == "status" and not np.isin(block, (*STATUSES.values(), EMPTY_POINT_STATUS)).all():
                 raise ValueError("it has a status that there is not")
             return block
@@ -311,7 +311,7 @@ class StudyStore:
         return "/".join([name, "c", *map(str, index), *map(str, padding)])
 
     def _write_block(self, name: str, index: Sequence[int], block: np.ndarray) -> None:
-        files.write_file(self.root / self._key(name, index), self.arrays[name].encode_chunk(block))
+        store_metadata.write_file(self.root / self._key(name, index), self.arrays[name].encode_chunk(block))
 
     # -- survey -------------------------------------------------------------------------------------------------------
 

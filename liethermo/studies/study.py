@@ -25,7 +25,7 @@ from ..runs.noise import Fluctuations, check_noise
 from ..runs.preparation import check_choice, checked_or_default_method
 from ..runs.schedule import make_schedule
 from ..systems import System
-from . import files, identity
+from . import identity, store_metadata
 from .axes import Axes, Zipped, axes_in_store_order
 from .measures import At, Measure, SolutionMeasure, ValuesAtTimes, parse_measures_and_event
 from .members import UNKNOWN_PARAMETER_TEXT, AccessRecorder, system_builder, to_python_values
@@ -178,9 +178,9 @@ class Study(metaclass=ListedType):
         if unknown:
             raise InputError(f"there is no axis, parameter or measure {unknown[0]!r} to name")
         self._spec = None if spec is None else dict(spec)
-        self._temporary_folder: files.TemporaryFolder | None = None
+        self._temporary_folder: store_metadata.TemporaryFolder | None = None
         if store is None:
-            self._temporary_folder = files.TemporaryFolder()
+            self._temporary_folder = store_metadata.TemporaryFolder()
             store = self._temporary_folder.path / "study.zarr"
         self.store = Path(store)
         parameters = self._axes.parameter_names
@@ -218,11 +218,11 @@ class Study(metaclass=ListedType):
         """
         store, axes = self._open_or_create_store_and_axes()
         is_interrupted = False
-        with files.lock_store(store.root) as record_run:
+        with store_metadata.lock_store(store.root) as record_run:
             store, axes = (
                 self._open_or_create_store_and_axes()
             )  # another run may have changed it before the lock was taken
-            files.remove_partial_files(store.root)
+            store_metadata.remove_partial_files(store.root)
             if store.shape != axes.shape:
                 store = store.extend(axes)
             survey = store.survey()

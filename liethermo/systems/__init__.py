@@ -3,24 +3,21 @@
 from .attitude import MOMENTUM_LESS_IMPULSE, SPATIAL_MOMENTUM, AttitudeSystem, TurningSystem, momentum_system_of
 from .base import System
 from .baths import HeatBaths
-from .chart import ChartSystem
-from .chetaev import ChetaevSystem
-from .composed.bodies import Copies, Subsystem
-from .composed.matter import Membrane, Reaction
+from .composed.bodies import Copies, Membrane, Reaction, Subsystem
 from .composed.system import ComposedSystem
+from .domain import Domain
 from .driven import DrivenSystem, make_autonomous
-from .embedded import EmbeddedSystem, embed_in_arrays
+from .embedded import ChartSystem, EmbeddedSystem, embed_in_arrays
 from .equilibria import Equilibria, Equilibrium, equilibria, steady_state
-from .euler_poincare import EulerPoincareSystem, Legendre
-from .euler_poincare_closed import EulerPoincareClosedSystem
+from .euler_poincare import EulerPoincareClosedSystem, EulerPoincareSystem, Legendre
 from .evolution import ContactSystem, EvolutionSystem
+from .hamiltonian import RotatingFrame
 from .herglotz import Herglotz, ThermodynamicHerglotz
 from .lie_poisson import LiePoissonSystem
 from .linearisation import Linearisation, Stability, linearise
 from .metriplectic import MetriplecticSystem
 from .quantum import QuantumSystem
-from .rotating_frame import RotatingFrame
-from .simple_closed import SimpleClosedSystem
+from .simple_closed import ChetaevSystem, SimpleClosedSystem
 from .spins import SpinSystem
 
 __all__ = [
@@ -32,6 +29,7 @@ __all__ = [
     "ComposedSystem",
     "ContactSystem",
     "Copies",
+    "Domain",
     "DrivenSystem",
     "EmbeddedSystem",
     "Equilibria",

@@ -64,7 +64,7 @@ class AttitudeSystem(LiftedSystem):
         group = momentum_system_of(body).group
         assert group is not None
         self.body, self.reconstruction, self.group, self.space = body, reconstruction, group, None
-        self.dim = body.dim + self._n_real_parts * group.matrix_size**2 + (group.dim if body.has_impulse else 0)
+        self.dim = body.dim + self._n_real_parts * group.matrix_size**2 + self.impulse_dim
         self.poisson, self.dissipation, self.momentum_maps = body.poisson, body.dissipation, {}
         self.energy = self.extend(body.energy)
         self.entropy = None if body.entropy is None else self.extend(body.entropy)
@@ -104,7 +104,7 @@ class AttitudeSystem(LiftedSystem):
     @property
     def clock(self) -> Clock | None:
         clock = self.body.clock
-        return clock and replace_fields(clock, n_last_counters=self.group.dim if self.has_impulse else 0)
+        return clock and replace_fields(clock, n_last_counters=self.impulse_dim)
 
     def body_at_attitude(self, x) -> LiePoissonSystem | DrivenSystem:
         """Return the body with its torque bound to the attitude of a state."""
@@ -140,7 +140,7 @@ class AttitudeSystem(LiftedSystem):
         if batch_shape and not batch:
             raise InputError(f"a run has one attitude, of shape {self.group.identity.shape}, not {g.shape}")
         mu, g = jnp.broadcast_to(mu, (*batch_shape, mu.shape[-1])), jnp.broadcast_to(g, (*batch_shape, *g.shape[-2:]))
-        if not self.has_impulse:
+        if not self.impulse_dim:
             return self.join_state(mu, g)
         return self.join_state(mu, g, jnp.einsum("...a,...ab->...b", mu[..., : self.group.dim], self.spatial_action(g)))
 
@@ -195,12 +195,17 @@ class AttitudeSystem(LiftedSystem):
     def constant_names(self):
         if not is_torque_free(self.body):
             return ()
-        return (MOMENTUM_LESS_IMPULSE,) if self.has_impulse else (SPATIAL_MOMENTUM,)
+        return (MOMENTUM_LESS_IMPULSE,) if self.impulse_dim else (SPATIAL_MOMENTUM,)
+
+    @property
+    def impulse_dim(self) -> int:
+        """Number of components of the impulse; 0 if no torque changes the momenta."""
+        return self.group.dim if self.body.torque_laws.has_impulse else 0
 
     @property
     def impulse_names(self) -> tuple[str, ...]:
-        """Names of the components of the impulse; empty if no torque acts."""
-        return tuple(f"{IMPULSE_NAME} {i + 1}" for i in range(self.group.dim)) if self.has_impulse else ()
+        """Names of the components of the impulse."""
+        return tuple(f"{IMPULSE_NAME} {i + 1}" for i in range(self.impulse_dim))
 
     @property
     def ledger(self):
@@ -211,7 +216,7 @@ class AttitudeSystem(LiftedSystem):
 
     @property
     def state_blocks(self):
-        n, m = self.body.dim, self.dim - (self.group.dim if self.has_impulse else 0)
+        n, m = self.body.dim, self.dim - self.impulse_dim
         return *_body_blocks(self.body), slice(n, m), *([slice(m, None)] if m < self.dim else [])
 
     @property
@@ -222,7 +227,7 @@ class AttitudeSystem(LiftedSystem):
         (mu, g), body = self.split_state(x), self.body_at_attitude(x)
         dS = body.entropy_gradient(mu)
         xi = body.transport(mu, body.energy.gradient(mu), dS, tuple(L.gradient(mu) for L in body.preserved))
-        p = body.external_torque(mu)[: self.group.dim] @ self.spatial_action(g) if self.has_impulse else None
+        p = body.external_torque(mu)[: self.group.dim] @ self.spatial_action(g) if self.impulse_dim else None
         return self.join_state(body._vector_field(mu), g @ self.group.algebra.hat(xi[: self.group.dim]), p)
 
     @property
@@ -266,7 +271,7 @@ def _spatial_momentum_and_scale(system: AttitudeSystem, x) -> tuple[jax.Array, j
     mu, action = state[: system.group.dim], system.spatial_action(g)
     momentum = mu @ action
     scale = jnp.maximum(jnp.max(jnp.abs(mu) @ jnp.abs(action)), system.body.momentum_scale(state))
-    return momentum - p if system.has_impulse else momentum, scale
+    return momentum - p if system.impulse_dim else momentum, scale
 
 
 ANGLE_UNIT = 2.0**-300
@@ -297,7 +302,7 @@ class TurningSystem(LiftedSystem):
     def __init__(self, attitude_system: AttitudeSystem, order: int, attitude: jax.Array):
         body = attitude_system.body
         self.attitude_system, self.order, self.attitude = attitude_system, order, attitude
-        self.dim, self.space = body.dim + attitude_system.group.dim * (2 if attitude_system.has_impulse else 1), None
+        self.dim, self.space = body.dim + attitude_system.group.dim + attitude_system.impulse_dim, None
         self.poisson = mf.NoPoisson(self.dim)  # field() computes the motion
         self.energy, self.entropy = attitude_system.energy, attitude_system.entropy
         self._lift_laws()
@@ -309,7 +314,7 @@ class TurningSystem(LiftedSystem):
     @property
     def state_blocks(self):
         n, m = self.inner.dim, self.inner.dim + self.attitude_system.group.dim
-        return *_body_blocks(self.inner), slice(n, m), *([slice(m, None)] if self.has_impulse else [])
+        return *_body_blocks(self.inner), slice(n, m), *([slice(m, None)] if m < self.dim else [])
 
     def pullback(self, energy: Energy) -> Energy:
         return self.extend(energy)
@@ -320,7 +325,7 @@ class TurningSystem(LiftedSystem):
         velocity = body.transport(*arguments)[: algebra.dim]
         angle_rates = maps.inverse_dexp(algebra, self.angles(x), velocity, self.order)
         rates = [body.field(*arguments), ANGLE_UNIT * angle_rates]
-        if self.has_impulse:
+        if self.torque_laws.has_impulse:
             torque = body.external_torque(arguments[0])
             assert torque is not None
             rates.append(
@@ -330,7 +335,7 @@ class TurningSystem(LiftedSystem):
 
     def inner_at(self, x) -> System:
         body = self.inner
-        if isinstance(body, DrivenSystem) and body.needs_attitude:
+        if isinstance(body, DrivenSystem) and body.torque_laws.needs_attitude:
             return body.bind_attitude(self._attitude_at(x))
         return body
 

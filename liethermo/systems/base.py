@@ -16,13 +16,13 @@ from manifolds._precision import with_library_settings
 from manifolds._pytree_module import replace_fields
 from manifolds.structures.poisson import ProductPoisson
 
-from ..dissipation.base import Dissipation, sum_dissipations
+from ..dissipation.base import Dissipation, dissipation_terms, sum_dissipations
 from ..dissipation.heating import couple_to_baths
 from ..errors import InputError
+from ..functions.bath_energy import BodyBathsEnergy
 from ..functions.checks import checked_energy, trace_energies, with_polynomial_degrees
 from ..functions.energy import Energy, make_energy
 from ..functions.on_spaces import energy_of_vectors, flatten_site_functions
-from ..functions.with_baths import BodyBathsEnergy
 from ..tracing.short_form import arguments_form
 from ..tracing.traced import trace_callables
 from .baths import BathEntropy, HeatBaths, poisson_with_baths
@@ -66,7 +66,7 @@ class System(SystemInterface):
             "entropy": None if self.baths is not None and isinstance(body.entropy, BathEntropy) else body.entropy,
             "dissipation": self.dissipation,
             "baths": self.baths,
-            "torque": self.torque_name,
+            "torque": self.torque_laws.name,
         }
         name = f"{self.dim} components" if state_space is None else state_space.name
         return f"{type(self).__name__}({name}, {arguments_form(parts)})"
@@ -111,15 +111,13 @@ class System(SystemInterface):
             self.energy = with_polynomial_degrees(self.energy, dim)
             self.entropy = None if self.entropy is None else with_polynomial_degrees(self.entropy, dim)
             self.momentum_maps = {name: with_polynomial_degrees(J, dim) for name, J in self.momentum_maps.items()}
-        dissipation = sum_dissipations(dissipation)
-        bath_terms: tuple[Dissipation, ...] = ()
-        if dissipation is not None:
 
-            def drives_baths(term: Dissipation) -> bool:
-                return term.acts_on_baths_alone or (self.entropy is None and term.needs_entropy)
+        def drives_baths(term: Dissipation) -> bool:
+            return term.acts_on_baths_alone or (self.entropy is None and term.needs_entropy)
 
-            bath_terms = tuple(term for term in dissipation.terms if drives_baths(term))
-            dissipation = sum_dissipations([term for term in dissipation.terms if not drives_baths(term)] or None)
+        terms = dissipation_terms(dissipation)
+        bath_terms = tuple(term for term in terms if drives_baths(term))
+        dissipation = sum_dissipations([term for term in terms if not drives_baths(term)] or None)
         for term in bath_terms:
             if baths is None and term.acts_on_baths_alone:
                 raise InputError(f"{type(term).__name__} acts on baths: give the system baths=lt.HeatBaths(...)")
@@ -222,9 +220,7 @@ class System(SystemInterface):
         By default the dissipation is that of the system; it may be another, such as one of its summands.
         """
         x, system = self.state(x), self if t is None else self.at_time(t)
-        dissipation = self.dissipation if dissipation is None else dissipation
-        if dissipation is None:
-            return jnp.zeros((self.dim, self.dim))
+        dissipation = self.total_dissipation if dissipation is None else dissipation
         dH, dL = system.energy.gradient(x), tuple(L.gradient(x) for L in dissipation.preserve)
         return jax.jacfwd(lambda dS: dissipation.force(system, x, dH, dS, dL))(jnp.zeros(self.dim))
 
@@ -343,7 +339,7 @@ def _attach_baths(system: System, baths: HeatBaths, bath_terms: tuple[Dissipatio
         return energy.on(range(n))
 
     if system.dissipation is not None or not bath_terms:
-        system.dissipation = couple_to_baths(system.dissipation, body, m, baths.has_positive_temperatures, extend)
+        system.dissipation = couple_to_baths(system.total_dissipation, body, m, baths.has_positive_temperatures, extend)
     if body.space is not None and body.space.dtype.kind == "c":
         raise InputError(f"baths are for real spaces, and {body.space.name} is complex")
     system.baths, system.dim = baths, n + m
@@ -355,7 +351,7 @@ def _attach_baths(system: System, baths: HeatBaths, bath_terms: tuple[Dissipatio
     system.momentum_maps = {name: extend(J) for name, J in body.momentum_maps.items()}
     if bath_terms:
         bound_terms = tuple(_bind_dissipation(system, term) for term in bath_terms)
-        system.dissipation = sum_dissipations([d for d in (system.dissipation, *bound_terms) if d is not None])
+        system.dissipation = sum_dissipations((*system.total_dissipation.terms, *bound_terms))
 
 
 def _drop_last_factor(space: mf.Space) -> mf.Space:

@@ -19,8 +19,8 @@ from ..errors import InputError
 from ..functions.bath_energy import BathEnergy, DrivenReservoirEnergy, ReservoirEnergy, bath_terms, make_bath_energy
 from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers
-from ..functions.each import Each
 from ..functions.energy import Energy, Sum
+from ..functions.mechanics import Each
 from ..tracing.short_form import short_form
 
 

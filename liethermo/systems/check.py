@@ -12,7 +12,7 @@ import numpy as np
 
 from manifolds._tables import TableRow, Tabular
 
-from ..dissipation.friction_operator import FRICTION_KERNEL_CHECK
+from ..dissipation.friction import FRICTION_KERNEL_CHECK
 from ..dissipation.geometry import project_tangent
 from ..dissipation.potential import CONVEXITY_CHECK, MINIMUM_AT_ZERO_CHECK
 from ..errors import AxiomError, CasimirError, InputError
@@ -259,7 +259,7 @@ def _stabilizer_residual(system: Any, chart_system: Any, x) -> jax.Array:
 def _dissipation_residuals(system: Any, x) -> dict[str, jax.Array]:
     """Return residuals of conditions on the arguments of dissipations, by name, the largest of equal names."""
     residuals: dict[str, jax.Array] = {}
-    for term in system.dissipations:
+    for term in system.total_dissipation.terms:
         for name, residual in term.input_residuals(system, x).items():
             residuals[name] = jnp.maximum(residuals.get(name, 0.0), residual)
     return residuals
@@ -284,8 +284,8 @@ def _matrix_residuals(system: Any, chart_system: Any, x, dH, dS):
         residuals["jacobi"] = relative(poisson.jacobi_residual(x), size(tensor) * variation)
     if system.entropy is not None:
         residuals["casimir"] = relative(size(tensor @ dS), size(tensor) * size(dS))
-    dissipation = system.dissipation
-    if dissipation is not None and dissipation.entropy_law == "nondecreasing" and dissipation.is_symmetric:
+    dissipation = system.total_dissipation
+    if dissipation.entropy_law == "nondecreasing" and dissipation.is_symmetric:
         K = system.friction_matrix(x)
         residuals["symmetric"] = relative(size(K - K.T), size(K))
         residuals["kernel"] = relative(size(K @ dH), size(K) * size(dH))

@@ -47,7 +47,7 @@ def rates_of_change(model: tuple[SystemInterface, tuple[Energy, ...]], x) -> Inv
     motion = system.poisson.sharp(x, dH)
     velocities = [motion]
     speeds = [jnp.linalg.norm(motion) + jnp.linalg.norm(system.poisson.sharp(x, jnp.abs(dH)))]
-    for dissipation in system.dissipations:
+    for dissipation in system.total_dissipation.terms:
         dL = tuple(project_covector(system, x, L.gradient(x)) for L in dissipation.preserve)
         a, b = (project_covector(system, x, v * jnp.linalg.norm(d)) for v, d in zip(random, (dH, dS), strict=True))
         velocities.append(dissipation.force(system, x, dH, dS, dL))
@@ -61,7 +61,7 @@ def rates_of_change(model: tuple[SystemInterface, tuple[Energy, ...]], x) -> Inv
     value = energy if system.entropy is None else energy + system.entropy.value(x)
     is_defined = jnp.isfinite(jnp.stack([energy, *[value] * (len(velocities) - 1)]))
     rates = jnp.where(is_defined[:, None], rates, jnp.nan)
-    for i, dissipation in enumerate(system.dissipations, start=1):
+    for i, dissipation in enumerate(system.total_dissipation.terms, start=1):
         if dissipation.preserve:  # by construction, wherever it is defined
             is_preserved = _is_spanned(gradients, [L.gradient(x) for L in dissipation.preserve])
             rates = rates.at[i].set(jnp.where(is_preserved, 0.0, rates[i]))
@@ -71,7 +71,7 @@ def rates_of_change(model: tuple[SystemInterface, tuple[Energy, ...]], x) -> Inv
 
 def dissipation_keeps_casimirs(system: SystemInterface) -> bool:
     """Return whether no summand of the dissipation changes a Casimir, by construction."""
-    return all(term.preserves_casimirs for term in system.dissipations)
+    return all(term.preserves_casimirs for term in system.total_dissipation.terms)
 
 
 def project_covector(system: SystemInterface, x, alpha) -> jax.Array:

@@ -13,11 +13,11 @@ import manifolds as mf
 from manifolds._pytree_module import forward_to, replace_fields
 from manifolds.structures.poisson import PoissonBySharp, ProductPoisson
 
-from ..dissipation.base import SkewFriction
+from ..dissipation.base import SkewFriction, dissipation_name, sum_dissipations
 from ..errors import InputError
 from ..functions.checks import with_polynomial_degrees
-from ..functions.coordinates import ComponentMap
 from ..functions.energy import ChartEnergy, Energy, Linear, Pullback, Quadratic, StateTimeEnergy, Sum
+from ..functions.indices import ComponentMap
 from ..functions.time_span import TimeSpan
 from .base import System
 from .clock import WORK_NAME, Clock
@@ -74,14 +74,14 @@ class DrivenSystem(LiftedSystem):
         energy = Sum((*map(self._extend_term, body.energy.terms), _NegativeWork(unit)))
         self.energy = energy if self.space is not None else with_polynomial_degrees(energy, self.dim)
         self._lift_laws()
-        if body.torque_name:
+        if body.torque_laws.name:
             has_law = body.entropy_law is not None or body.entropy is None
-            torque = _TorqueForce(law=body.torque_entropy_law if has_law else None)
-            self.dissipation = torque if self.dissipation is None else self.dissipation + torque
+            torque = _TorqueForce(law=body.torque_laws.entropy_law if has_law else None)
+            self.dissipation = sum_dissipations((*self.total_dissipation.terms, torque))
 
     @property
     def kind(self) -> str:
-        return f"{self.body.kind} {'with a torque' if self.body.torque_name else 'whose energy depends on time'}"
+        return f"{self.body.kind} {'with a torque' if self.body.torque_laws.name else 'whose energy depends on time'}"
 
     # -- the state --------------------------------------------------------------------------------------------------
 
@@ -110,17 +110,10 @@ class DrivenSystem(LiftedSystem):
         times = scale * np.random.default_rng(seed).standard_normal(count)
         return np.column_stack([self.body.samples(count, seed, scale), self.unit * times, np.zeros(count)])
 
-    def outside(self, x) -> str:
-        return self._body_at_first_time(x).outside(x[..., :-2])
-
-    def why_singular(self, x) -> str:
-        return self._body_at_first_time(x).why_singular(x[..., :-2])
-
     def run_conditions(self, x, t, guarantees):
         return self.body.run_conditions(x[:, :-2], t, guarantees)
 
-    def _body_at_first_time(self, x) -> System:
-        """Return the body with its time frozen at that of the first of several states, which must not be traced."""
+    def _inner_at_first(self, x) -> System:
         t = float(np.reshape(x, (-1, self.dim))[0, -2]) / self.unit
         return self._body_at_time(min(max(t, float(self.span.start)), float(self.span.end)))
 
@@ -138,12 +131,11 @@ class DrivenSystem(LiftedSystem):
         return self._body_at_time(self.time(x))
 
     body_dim = forward_to("body")
-    needs_attitude = forward_to("body")
 
     def field(self, x, dH, dS, dL=()):
         motion = self.inner_at(x).drop_torque().field(*self.inner_arguments(x, dH, dS, dL))
         motion = jnp.concatenate([motion, _clock_velocity(dH, self.unit)])
-        return motion + self.torque_velocity(x, dH) if self.torque_name else motion
+        return motion + self.torque_velocity(x, dH) if self.torque_laws.name else motion
 
     def external_torque(self, x):
         return self.inner_at(x).external_torque(x[:-2]) if self.torque is None else self.torque
@@ -156,17 +148,16 @@ class DrivenSystem(LiftedSystem):
 
     def bind_attitude(self, attitude) -> DrivenSystem:
         """Return the system with its torque evaluated at an attitude, shape (m, m)."""
-        if not self.needs_attitude:
-            return self
-        return replace_fields(self, attitude=attitude)
+        return replace_fields(self, attitude=attitude) if self.torque_laws.needs_attitude else self
 
     def with_torque(self, torque) -> DrivenSystem:
         """Return the system with a fixed torque, shape (body.dim,)."""
         return replace_fields(self, torque=torque)
 
-    def solve_rotation(self, angles, v):
-        u = self.body.solve_rotation(angles, v[:-2])
-        return None if u is None else jnp.concatenate([u, v[-2:]])
+    def solve_at_spins(self, x, dH, noise_rates, half_step, velocities):
+        body_velocities = [v[:-2] for v in velocities]
+        u = self.body.solve_at_spins(x[:-2], dH[:-2], noise_rates, half_step, body_velocities)
+        return None if u is None else jnp.concatenate([u, sum(v[-2:] for v in velocities)])
 
     def raise_index(self, x, alpha):
         """Return the direction of a correction along alpha, without components along the clock and the work."""
@@ -195,7 +186,7 @@ class DrivenSystem(LiftedSystem):
         entries = {"system": type(body).__name__, "x0": x[0].tolist() if solution.provenance.get("x0") else None}
         if body.lie_algebra is not None:
             entries["algebra"] = body.lie_algebra.name
-        entries["dissipation"] = None if body.dissipation is None else type(body.dissipation).__name__
+        entries["dissipation"] = dissipation_name(body.dissipation)
         energy = solution.energy + solution.casimirs[WORK_NAME]
         body_solution = dataclasses.replace(solution, x=x, energy=energy, dense=dense).with_provenance(**entries)
         return body.to_user_solution(body_solution)
@@ -228,7 +219,7 @@ class _TorqueForce(SkewFriction):
     """The torque on a body and the work that it does."""
 
     is_noiseless = True
-    preserves_casimirs = True  # of :attr:`System.torque_invariant_casimirs`; no other Casimir is claimed
+    preserves_casimirs = True  # but those that :attr:`System.torque_laws` lists as changed
 
     def force(self, system, x, dH, dS, dL):
         return system.torque_velocity(x, dH)

@@ -19,13 +19,14 @@ from manifolds._arrays import is_traced
 from manifolds._pytree_module import forward_to
 from manifolds.structures.poisson import PoissonBySharp
 
-from ..dissipation.base import LiftedDissipation, LiftedGeometry
+from ..dissipation.base import LiftedDissipation, LiftedGeometry, dissipation_name
 from ..functions.checks import with_polynomial_degrees
 from ..functions.energy import Energy
 from ..functions.surface import ConstraintSurface
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.programs import subprogram
 from .base import System
+from .domain import Domain
 from .interface import EngineHints
 
 TANGENCY_RTOL = 1e-12
@@ -70,8 +71,9 @@ class EmbeddedSystem(System):
     kind = forward_to("manifold")
 
     @property
-    def domain(self) -> str:  # type: ignore[override]
-        return f"a point of {_require_space(self.manifold).name}"
+    def domain(self) -> Domain:
+        name, why_singular = _require_space(self.manifold).name, self.manifold.domain.why_singular
+        return Domain(f"a point of {name}", self._why_outside, why_singular)
 
     ledger = forward_to("manifold")
 
@@ -84,19 +86,18 @@ class EmbeddedSystem(System):
     def surface(self) -> ConstraintSurface:
         return ConstraintSurface(_require_space(self.manifold), self.is_tangent)
 
-    def outside(self, x) -> str:
+    def _why_outside(self, x) -> str:
         space, x = _require_space(self.manifold), np.atleast_2d(x)
         if not np.isfinite(x).all():
             return ""
         is_inside = evaluate_at_points(_inside_indicator, self.surface, x) > 0.0
         if is_inside.all():
-            return self.manifold.outside(x)
+            return self.manifold.domain.why_outside(x)
         point = np.asarray(self.points(x[is_inside.argmin()]))
         return f"the step leaves {space.name}: {space._why_off_space(point, np.inf)}"
 
     # -- states -------------------------------------------------------------------------------------------------------
 
-    why_singular = forward_to("manifold")
     points = forward_to("manifold")
     state_array = forward_to("manifold")
     energy_of_vectors = forward_to("manifold")
@@ -105,10 +106,9 @@ class EmbeddedSystem(System):
     _around = forward_to("manifold")
 
     def to_user_solution(self, solution):
-        dissipation = self.manifold.dissipation
-        kind = None if dissipation is None else type(dissipation).__name__
+        name = dissipation_name(self.manifold.dissipation)
         return self.manifold.to_user_solution(
-            solution.with_provenance(system=type(self.manifold).__name__, dissipation=kind)
+            solution.with_provenance(system=type(self.manifold).__name__, dissipation=name)
         )
 
     # -- dynamics -----------------------------------------------------------------------------------------------------
@@ -237,3 +237,99 @@ def _tangential_part_in_space(space: mf.Space, x, w):
 def _require_space(system: System) -> mf.Space:
     assert system.space is not None
     return system.space
+
+
+class ChartSystem(System):
+    """A system on a manifold in coordinates c of a chart, shape (dim,).
+
+    Parameters
+    ----------
+    system : System
+        A system on a manifold.
+    coordinates : manifolds.Coordinates
+    place : manifolds.Place, optional
+        Fixed point at which Pi and K are evaluated, instead of the point with the coordinates c.
+    start : array, optional
+        State vector at the start of the step, for a system that serves one step.
+    """
+
+    manifold: System
+    coordinates: mf.Coordinates
+    place: mf.Place | None
+    start: jax.Array | None
+
+    def __init__(self, system: System, coordinates: mf.Coordinates, place: mf.Place | None = None, start=None):
+        assert system.space is not None
+        self.manifold, self.coordinates, self.place, self.start = system, coordinates, place, start
+        self.dim, self.space, self.momentum_maps = system.space.dim, None, {}
+        self.energy = self.pullback(system.energy)
+        self.entropy = None if system.entropy is None else self.pullback(system.entropy)
+        trivial = isinstance(system.poisson, mf.NoPoisson)
+        self.poisson = mf.NoPoisson(self.dim) if trivial else _ChartPoisson(system, coordinates, place)
+        self.momentum_maps = {name: self.pullback(J) for name, J in system.momentum_maps.items()}
+        self.dissipation = _ChartDissipation.lift_terms(system.dissipation, self.pullback, system, coordinates, place)
+        self.preserved_labels, self.invariant_verdicts = system.preserved_labels, system.invariant_verdicts
+
+    def pullback(self, energy: Energy) -> Energy:
+        """Return a function of coordinates from a function of states."""
+        space = self.manifold.space
+        assert space is not None
+        return energy.map_terms(lambda term: term.pullback_to_chart(self.coordinates, space, self.start))
+
+    @property
+    def hints(self) -> EngineHints:
+        return super().hints._replace(is_smooth=self.manifold.hints.is_smooth)
+
+    def freeze_at(self, x) -> System:
+        if self.place is not None:
+            return self
+        return ChartSystem(self.manifold, self.coordinates, self.coordinates.at(x), self.start)
+
+    def field(self, x, dH, dS, dL=()):
+        point = _ChartPoint(self.manifold, self.coordinates, self.place, x)
+        dS, dL = None if dS is None else point.lift(dS), tuple(map(point.lift, dL))
+        return point.lower(self.manifold.field(point.state, point.lift(dH), dS, dL))
+
+
+class _ChartPoint:
+    """A point of the manifold with the maps between covectors and velocities of coordinates and of states."""
+
+    def __init__(self, system: System, coordinates: mf.Coordinates, place: mf.Place | None, c):
+        assert system.space is not None
+        self._space, self._place = system.space, coordinates.at(c) if place is None else place
+        self.state = self._space.to_vector(self._place.point)
+
+    def lift(self, alpha):
+        return self._space.to_vector(self._place.lift(alpha).conj())
+
+    def lower(self, v):
+        return self._place.lower(self._space.from_vector(v))
+
+
+class _ChartPoisson(PoissonBySharp):
+    system: System
+    coordinates: mf.Coordinates
+    place: mf.Place | None
+
+    @property
+    def dim(self) -> int:
+        assert self.system.space is not None
+        return self.system.space.dim
+
+    def sharp(self, x, alpha):
+        point = _ChartPoint(self.system, self.coordinates, self.place, x)
+        return point.lower(self.system.poisson.sharp(point.state, point.lift(alpha)))
+
+
+class _ChartDissipation(LiftedDissipation):
+    system: System
+    coordinates: mf.Coordinates
+    place: mf.Place | None
+
+    def lifted_geometry(self, system, x) -> LiftedGeometry:
+        point = _ChartPoint(self.system, self.coordinates, self.place, x)
+        return LiftedGeometry(self.system, point.state, point.lift, point.lower)
+
+    def divergence(self, system, x):
+        """Return the divergence with respect to the volume of the manifold."""
+        return self.inner.divergence(self.system, _ChartPoint(self.system, self.coordinates, self.place, x).state)

@@ -315,7 +315,9 @@ def _level_names(
 
 def _is_damped(system: System, points: np.ndarray) -> bool:
     """Return whether the dissipation moves some of the points, shape (points, n); with rate zero it moves none."""
-    return system.dissipation is not None and bool(np.any(evaluate_at_points(_dissipative_velocity, system, points)))
+    return bool(system.total_dissipation.terms) and bool(
+        np.any(evaluate_at_points(_dissipative_velocity, system, points))
+    )
 
 
 def _dissipative_velocity(system: System, x):
@@ -386,7 +388,7 @@ class _Search(NamedTuple):
             rejected[chosen], rejected[other] = 0, rejected[other] + 1
             active[(rejected > PATIENCE) | (damping > MAX_DAMPING) | (costs == 0.0)] = False
         accepted = np.isfinite(costs) & self._is_at_rest(current, scale) & self._is_on_leaf(current, scale)
-        accepted &= np.array([not self.system.outside(x) for x in states], dtype=bool)
+        accepted &= np.array([not self.system.domain.why_outside(x) for x in states], dtype=bool)
         return states[accepted]
 
     def follow_transient(self, x: np.ndarray, scale: float) -> np.ndarray:
@@ -405,7 +407,11 @@ class _Search(NamedTuple):
             trial = self._move(x[None], displacement[None], current.frame)
             evaluated = self.evaluate(trial)
             new_speed = np.linalg.norm(evaluated.velocity)
-            if not np.isfinite(new_speed) or self.system.outside(trial[0]) or new_speed > STEP_GROWTH_LIMIT * speed:
+            if (
+                not np.isfinite(new_speed)
+                or self.system.domain.why_outside(trial[0])
+                or new_speed > STEP_GROWTH_LIMIT * speed
+            ):
                 step *= 0.25
                 continue
             step *= float(np.clip(speed / new_speed if new_speed > 0.0 else np.inf, 0.5, STEP_GROWTH_LIMIT))

@@ -14,10 +14,10 @@ from manifolds._pytree_module import Module
 
 from ..dissipation.base import SkewFriction, nondecreasing_if
 from ..errors import InputError
-from ..functions.arguments import required_argument_count
 from ..functions.checks import checked_energy, with_polynomial_degrees
 from ..functions.energy import Energy, Quadratic, make_energy
 from ..functions.mechanics import is_mechanical
+from ..functions.time_span import required_argument_count
 from .base import System
 from .embedded import EmbeddedSystem
 from .states import evaluate_batch

@@ -1,22 +1,38 @@
-"""The Hamiltonian of a quantum system as users write it, with QuTiP's time-dependent form, as a mean energy."""
+"""Hamiltonians and density matrices of quantum systems as users give them, and systems in a rotating frame."""
 
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
 
 import manifolds as mf
+from manifolds._class_members import ListedType
+from manifolds._pytree_module import Module
+from manifolds.matrices.linear import adjoint
 
-from ..dissipation.operators import HasMatrix, checked_hermitian, checked_square_matrix
+from ..dissipation.lindblad import LindbladJumps, OperatorFunction
+from ..dissipation.operators import HasMatrix, Operator, checked_hermitian, checked_square_matrix, level_gap_rounding
+from ..dissipation.quantum import cluster_labels
 from ..errors import InputError
-from ..functions.density import ExpectationValue, MeanEnergy, ModulatedExpectationValue, choose_reference_level
+from ..functions.bath_energy import BathEnergy, ReservoirEnergy
+from ..functions.density import (
+    NEGATIVE_EIGENVALUE_LIMIT,
+    ExpectationValue,
+    MeanEnergy,
+    ModulatedExpectationValue,
+    choose_reference_level,
+)
 from ..functions.energy import Energy, TimeDependent
-from ..functions.piecewise import ContinuedSpline
+from ..functions.time_span import ContinuedSpline
+from .baths import HeatBaths
 from .invariants import TEST_TIMES
 
 
@@ -134,3 +150,281 @@ def _coefficient_function(coefficient, times, i: int) -> Callable:
             f"{knots.shape} and {values.shape}"
         )
     return ContinuedSpline(scipy.interpolate.CubicSpline(knots, values))  # as QuTiP interpolates it
+
+
+DENSITY_MATRIX_TOLERANCE = 1e-12
+"""Largest difference of a trace from one, and of a density matrix from its adjoint, that is accepted as input."""
+
+
+def checked_density_matrices(rho: np.ndarray, size: int, mixed: float) -> np.ndarray:
+    """Return checked density matrices, shape (..., N, N), from matrices, kets, a bra or a stacked operator.
+
+    Raises
+    ------
+    InputError
+        If an array has another shape, or is not Hermitian, positive and of trace one.
+    """
+    if rho.dtype.kind not in "fiuc":
+        raise InputError(f"a density matrix must be an array of numbers, got {rho.dtype}")
+    if not np.isfinite(rho).all():
+        raise InputError("the density matrix must be finite")
+    if size > 1 and rho.shape == (1, size):  # a bra
+        rho = adjoint(rho)
+    if size > 1 and rho.shape == (size**2, 1):  # an operator as QuTiP stacks it, by columns
+        rho = rho.reshape(size, size).T
+    if rho.shape == (size,) or (size > 1 and rho.shape[-2:] == (size, 1)):
+        rho = _density_of_kets(rho[:, None] if rho.ndim == 1 else rho)
+    if rho.shape[-2:] != (size, size):
+        raise InputError(
+            f"a density matrix of this system must have shape ({size}, {size}), got {rho.shape}; a ket has the shape "
+            f"({size},) or ({size}, 1)"
+        )
+    asymmetry = float(np.abs(rho - adjoint(rho)).max())
+    if asymmetry > DENSITY_MATRIX_TOLERANCE:
+        raise InputError(f"the density matrix must be Hermitian, but it differs from its adjoint by {asymmetry:.3g}")
+    trace = np.trace(rho, axis1=-2, axis2=-1).real
+    wrong_trace = float(trace.ravel()[np.argmax(np.abs(trace - 1.0))])
+    if abs(wrong_trace - 1.0) > DENSITY_MATRIX_TOLERANCE:
+        raise InputError(f"the density matrix must have trace 1, got {wrong_trace:.15g}. Divide it by its trace")
+    min_eigenvalue = float(np.linalg.eigvalsh(rho)[..., 0].min())
+    if min_eigenvalue < -NEGATIVE_EIGENVALUE_LIMIT:
+        raise InputError(f"the density matrix must be positive, but its least eigenvalue is {min_eigenvalue:.3g}")
+    if not isinstance(mixed, int | float | np.number) or not 0.0 <= mixed <= 1.0:
+        raise InputError(f"mixed, the weight of the maximally mixed state, must be a number from 0 to 1, got {mixed!r}")
+    return (1.0 - mixed) * rho + mixed * np.eye(size) / size
+
+
+def _density_of_kets(ket: np.ndarray) -> np.ndarray:
+    """Return the density matrices, shape (..., N, N), of pure states, shape (..., N, 1)."""
+    norms = np.linalg.norm(ket, axis=-2)
+    wrong_norm = float(norms.ravel()[np.argmax(np.abs(norms - 1.0))])
+    if abs(wrong_norm - 1.0) > DENSITY_MATRIX_TOLERANCE:
+        raise InputError(f"the ket must have norm 1, got {wrong_norm:.15g}. Divide the ket by its norm")
+    ket = ket / norms[..., None]
+    return ket @ adjoint(ket)
+
+
+def checked_parts(parts, names, size: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Return the dimensions of the factors of a product, and their names."""
+    parts = (size,) if parts is None else tuple(int(n) for n in parts)
+    if math.prod(parts) != size or min(parts) < 1:
+        raise InputError(f"the product of the sizes of the parts must be {size}, got the sizes {parts}")
+    names = tuple(names)
+    if names and (len(names) != len(parts) or len(set(names)) != len(names)):
+        raise InputError(f"names must be {len(parts)} different names, one for each part, got {names!r}")
+    return parts, names
+
+
+def tensor_with_identity(matrix: np.ndarray, k: int, sizes: Sequence[int]) -> np.ndarray:
+    """Return an operator of the k-th of two systems as an operator of their product."""
+    return np.kron(matrix, np.eye(sizes[1])) if k == 0 else np.kron(np.eye(sizes[0]), matrix)
+
+
+def join_baths(a: HeatBaths | None, b: HeatBaths | None) -> HeatBaths | None:
+    """Return the baths of a product of two systems, those of the first one first."""
+    if a is None or b is None:
+        return a or b
+    kinds = BathEnergy | ReservoirEnergy
+    if not isinstance(a.energy, kinds) or not isinstance(b.energy, kinds):
+        raise InputError("baths of a product have constant capacities: build the product with baths of its own")
+    capacity, temperature = (
+        jnp.concatenate([getattr(a.energy, name), getattr(b.energy, name)]) for name in ("capacity", "temperature")
+    )
+    return HeatBaths(capacity, temperature, a.number + b.number)
+
+
+class RotatingFrame(metaclass=ListedType):
+    """A frame that turns by ``exp(-i G t)``: its density matrices are ``exp(i G t) rho exp(-i G t)`` (hbar = 1).
+
+    There the Hamiltonian is ``exp(i G t) H(t) exp(-i G t) - G``. It is constant for a drive that turns with G. A linear
+    drive, ``H0 + cos(omega t) D``, leaves terms that oscillate at ``2 omega``; the rotating-wave approximation drops
+    them.
+
+    Parameters
+    ----------
+    generator : array, shape (N, N)
+        G, Hermitian (energy). For a drive of the frequency omega between two groups of levels it is omega times the
+        projector onto the upper group.
+
+    Raises
+    ------
+    InputError
+
+    Examples
+    --------
+    The optical Bloch equations: an atom with the frequency 10, a laser of 9.8 with the Rabi frequency 0.4, decay 0.1.
+
+    >>> excited, lower = np.diag([0.0, 1.0]), np.array([[0.0, 1.0], [0.0, 0.0]])
+    >>> frame = lt.RotatingFrame(9.8 * excited)
+    >>> H = frame.rotating_wave(10.0 * excited, 0.4 * (lower + lower.T), frequency=9.8)
+    >>> np.round(H.real, 12).tolist()
+    [[0.0, 0.2], [0.2, 0.2]]
+    >>> atom = lt.QuantumSystem(H, frame.jumps([(lower, 0.1)]))
+    >>> round(float(atom.density(atom.steady_state().x)[1, 1].real), 4)
+    0.3265
+    """
+
+    generator: np.ndarray
+    levels: np.ndarray
+    vectors: np.ndarray
+
+    def __init__(self, generator):
+        self.generator = checked_hermitian(generator, "the generator of a frame")
+        self.levels, self.vectors = np.linalg.eigh(self.generator)
+
+    def __repr__(self) -> str:
+        return f"<RotatingFrame of {len(self.levels)} levels, frequencies {self.levels.round(6).tolist()}>"
+
+    def hamiltonian(self, hamiltonian, times=None) -> Callable:
+        """Return the Hamiltonian in the frame, a function of t to an array, shape (N, N), without approximation.
+
+        Parameters
+        ----------
+        hamiltonian, times
+            As of :class:`QuantumSystem`.
+        """
+        size, energy = hamiltonian_energy(hamiltonian, times)
+        self._check_size((size, size), "the Hamiltonian")
+        return _FrameHamiltonian(energy, jnp.asarray(self.levels), Operator(self.vectors))
+
+    def rotating_wave(self, constant, drive, frequency: float, phase: float = 0.0) -> np.ndarray:
+        """Return the constant part, shape (N, N), of ``constant + cos(frequency t + phase) drive`` in the frame.
+
+        The terms that are left out oscillate. They matter little if they are small beside their frequencies: for a
+        drive of the strength Omega at ``2 frequency``, the shift of Bloch and Siegert is ``Omega^2 / (4 frequency)``.
+
+        Parameters
+        ----------
+        constant, drive : array, shape (N, N)
+            Hermitian (energy).
+        frequency : float
+            Of the drive (1 / time).
+        phase : float
+            Of the drive (rad).
+
+        Raises
+        ------
+        InputError
+            If no part of the drive is at rest in the frame.
+        """
+        H, D = checked_hermitian(constant, "the constant part"), checked_hermitian(drive, "the drive")
+        for matrix, what in ((H, "the constant part"), (D, "the drive")):
+            self._check_size(matrix.shape, what)
+        tolerance = self._tolerance + 1e-12 * abs(frequency)
+        resonant = np.zeros_like(H)
+        # exp(i G t) V exp(-i G t) = V exp(-i omega t) for a component with [G, V] = -omega V
+        for omega, component in self.components(D).items():
+            if abs(omega - frequency) <= tolerance:
+                resonant += 0.5 * np.exp(1j * phase) * component
+            if abs(omega + frequency) <= tolerance:
+                resonant += 0.5 * np.exp(-1j * phase) * component
+        if D.any() and not resonant.any():
+            found = ", ".join(f"{omega:.6g}" for omega in self.components(D) if omega >= 0.0)
+            raise InputError(
+                f"no part of the drive is at rest in the frame: its frequencies there are {found}, and that of the "
+                f"drive is {frequency:.6g}. Give the frame a generator whose level distances contain that frequency"
+            )
+        at_rest = self.components(H)
+        static = sum((V for omega, V in at_rest.items() if abs(omega) <= self._tolerance), np.zeros_like(H))
+        H = static - self.generator + resonant
+        return (H + adjoint(H)) / 2
+
+    def components(self, operator) -> dict[float, np.ndarray]:
+        """Return the components V of an operator with ``[G, V] = -omega V`` by their frequencies omega, ascending.
+
+        Parameters
+        ----------
+        operator : array, shape (N, N)
+        """
+        V = checked_square_matrix(operator, "the operator")
+        self._check_size(V.shape, "the operator")
+        inside = adjoint(self.vectors) @ V @ self.vectors
+        gaps = self.levels[None, :] - self.levels[:, None]
+        labels = cluster_labels(gaps.ravel(), self._tolerance).reshape(gaps.shape)
+        rounding = 1e-13 * np.abs(V).max()
+        parts = {}
+        for label in range(labels.max() + 1):
+            part = np.where(labels == label, inside, 0.0)
+            if np.abs(part).max() > rounding:
+                parts[float(gaps[labels == label].mean())] = self.vectors @ part @ adjoint(self.vectors)
+        return parts
+
+    def jumps(self, couplings: Sequence[tuple[Any, Any]]) -> LindbladJumps:
+        """Return :class:`LindbladJumps` in the frame, for operators that only get a phase there.
+
+        Parameters
+        ----------
+        couplings : list of (V, rate)
+            As of :class:`LindbladJumps`.
+
+        Raises
+        ------
+        InputError
+            If an operator has components of several frequencies: its jumps depend on time in the frame.
+        """
+        jumps = LindbladJumps(couplings)
+        for i, V in enumerate(jumps.operators):
+            if isinstance(V, OperatorFunction):
+                raise InputError(f"the jump operator V[{i}] depends on time. Give it in the frame to LindbladJumps")
+            frequencies = list(self.components(V))
+            if len(frequencies) > 1:
+                raise InputError(
+                    f"the jump operator V[{i}] has components of the frequencies {frequencies} in the frame, so it "
+                    "depends on time there. Give each of frame.components(V) a jump of its own, which is right if the "
+                    "rates are small beside the differences of these frequencies"
+                )
+        return jumps
+
+    def to_frame(self, matrix, t) -> np.ndarray:
+        """Return density matrices or observables in the frame.
+
+        Parameters
+        ----------
+        matrix : array, shape (..., N, N)
+        t : float or array, shape (...)
+            Times.
+        """
+        U = self._rotation(t)
+        return U @ np.asarray(matrix) @ adjoint(U)
+
+    def to_laboratory(self, matrix, t) -> np.ndarray:
+        """Return density matrices or observables of the frame as the laboratory sees them.
+
+        Parameters
+        ----------
+        matrix : array, shape (..., N, N)
+        t : float or array, shape (...)
+            Times.
+        """
+        U = self._rotation(t)
+        return adjoint(U) @ np.asarray(matrix) @ U
+
+    def _rotation(self, t) -> np.ndarray:
+        """Return ``exp(i G t)``, shape (..., N, N)."""
+        phases = np.exp(1j * np.asarray(t, dtype=np.float64)[..., None] * self.levels)
+        return (self.vectors * phases[..., None, :]) @ adjoint(self.vectors)
+
+    @property
+    def _tolerance(self) -> float:
+        return len(self.levels) * level_gap_rounding(self.generator)
+
+    def _check_size(self, shape: tuple[int, ...], what: str) -> None:
+        if shape != self.generator.shape:
+            generator_shape = self.generator.shape
+            raise InputError(f"{what} has shape {shape}, but the generator of the frame has shape {generator_shape}")
+
+
+class _FrameHamiltonian(Module):
+    """The Hamiltonian in a rotating frame, as a function of time."""
+
+    energy: Energy
+    levels: jax.Array
+    vectors: Operator = eqx.field(static=True)
+
+    def __call__(self, t):
+        structure = mf.DensityMatrices(self.levels.shape[0])
+        energy, origin = self.energy.at_time(t), jnp.zeros(structure.dim)
+        H = structure.matrix(energy.gradient(origin)) + energy.value(origin) * np.eye(structure.size)
+        phases, U = jnp.exp(1j * t * self.levels), np.asarray(self.vectors)
+        turned = phases[:, None] * (adjoint(U) @ H @ U) * phases.conj() - jnp.diag(self.levels)
+        return U @ turned @ adjoint(U)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from typing import ClassVar, NamedTuple, Self
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -11,13 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from ..dissipation.base import Dissipation, LawName
+from ..dissipation.base import ABSENT_DISSIPATION, Dissipation, LawName
 from ..dissipation.geometry import Geometry
 from ..functions.energy import Energy
 from ..functions.surface import Surface
 from .baths import HeatBaths
 from .clock import Clock
 from .conditions import RunCondition
+from .domain import Domain
 
 
 class InvariantVerdicts(NamedTuple):
@@ -32,6 +34,40 @@ class InvariantVerdicts(NamedTuple):
         verdicts = {**verdicts, **{name: True for name in declared if verdicts.get(name, True) is None}}
         constant = {name for name, verdict in verdicts.items() if verdict}
         return cls(frozenset(constant), frozenset(name for name, verdict in verdicts.items() if verdict is None))
+
+
+class OrbitLevels(NamedTuple):
+    """Common levels of Casimirs that are the orbits of a group.
+
+    Attributes
+    ----------
+    n_momenta : int
+        Number of momenta that the group acts on.
+    casimirs : frozenset of str
+        Names of the Casimirs whose common levels are the orbits.
+    has_all_casimirs : bool
+        Whether every Casimir is known to be a function of the Casimirs of the system.
+    """
+
+    n_momenta: int
+    casimirs: frozenset[str]
+    has_all_casimirs: bool = False
+
+
+class SparseNewton(NamedTuple):
+    """Functions of a system for Newton's method with a sparse Jacobian; by default no pattern is known.
+
+    Attributes
+    ----------
+    find_pattern : function without arguments to a sparse array, shape (n, n), or None
+        Returns the sparsity pattern of the Jacobian of the field, for discrete gradients too; None if it is not known.
+    residual_weights : function from a state, shape (n,), to an array, shape (n,)
+        Returns factors that make the components of the field nearly linear in the state. The equations of a stiff step
+        are solved multiplied by these factors.
+    """
+
+    find_pattern: Callable[[], scipy.sparse.csr_array | None] = lambda: None
+    residual_weights: Callable[[Any], jax.Array] = jnp.ones_like
 
 
 class EngineHints(NamedTuple):
@@ -52,6 +88,35 @@ class EngineHints(NamedTuple):
     is_smooth: bool = True
 
 
+@dataclass(frozen=True)
+class TorqueLaws:
+    """Name of the torque from outside that acts on a system, and its effects; by default no torque acts.
+
+    Attributes
+    ----------
+    name : str
+        Name of the torque; "" if none acts.
+    has_impulse : bool
+        Whether the torque may change momenta that the group acts on, and not only those of internal parts.
+    needs_attitude : bool
+        Whether the torque depends on the attitude.
+    changed_casimirs : frozenset of str
+        Names of the Casimirs that the torque may change.
+    entropy_law : {"conserved", "nondecreasing"}
+        Law of the entropy under the torque alone: "nondecreasing" if it heats.
+    """
+
+    name: str = ""
+    has_impulse: bool = False
+    needs_attitude: bool = False
+    changed_casimirs: frozenset[str] = frozenset()
+    entropy_law: LawName = "conserved"
+
+
+TORQUE_FREE_LAWS = TorqueLaws()
+"""Laws of a system on which no torque acts."""
+
+
 class SystemInterface(Geometry):
     """Data of a kind of system, and methods that a subclass may override.
 
@@ -68,8 +133,6 @@ class SystemInterface(Geometry):
     baths: HeatBaths | None = eqx.field(kw_only=True, default=None)
     """Baths that take the heat of the dissipation; their entropies are the last components of a state."""
     production_name: ClassVar[str] = "dS/dt"
-    domain: ClassVar[str] = ""
-    """Condition, in words, that a state must satisfy beside finite components."""
 
     @property
     def kind(self) -> str:
@@ -143,27 +206,10 @@ class SystemInterface(Geometry):
         x[self.body_dim :] = 0.0
         return x
 
-    def outside(self, x) -> str:
-        """Explain why a state lies outside the domain of the system; "" if it lies inside.
-
-        For several states, shape (..., n), the text is about one that lies outside.
-        """
-        return ""
-
-    def domain_margin(self, x) -> jax.Array | None:
-        """Return a number that is positive if and only if the parameters of the system allow the state x, shape (n,).
-
-        JAX traces it, for many systems at once; :meth:`outside` explains it in words. None if all parameters allow
-        all states.
-        """
-        return None
-
-    def why_singular(self, x) -> str:
-        """Explain why the gradient of the entropy is infinite at x, so that no run can start there; "" if it is finite.
-
-        For several states, shape (..., n), the text is about one of them.
-        """
-        return ""
+    @property
+    def domain(self) -> Domain:
+        """Conditions that a state must satisfy beside finite components, with functions that explain them."""
+        return Domain()
 
     def run_conditions(self, x: np.ndarray, t: np.ndarray, guarantees: frozenset[str]) -> tuple[RunCondition, ...]:
         """Return conditions of a run beside its laws, such as positive density matrices, for the rows of an audit.
@@ -199,24 +245,9 @@ class SystemInterface(Geometry):
         return eqx.tree_at(lambda system: system.energy, self, self.energy.at_time(t)) if self.is_driven else self
 
     @property
-    def torque_name(self) -> str:
-        """Name of the external torque; "" if none acts."""
-        return ""
-
-    @property
-    def has_impulse(self) -> bool:
-        """True if a torque may change momenta that the group acts on, and not only those of internal parts."""
-        return bool(self.torque_name)
-
-    @property
-    def torque_invariant_casimirs(self) -> frozenset[str]:
-        """Names of the Casimirs that the torque leaves constant."""
-        return frozenset() if self.torque_name else frozenset(self.casimirs())
-
-    @property
-    def needs_attitude(self) -> bool:
-        """True if the torque depends on the attitude."""
-        return False
+    def torque_laws(self) -> TorqueLaws:
+        """Name of the torque from outside, and what it does to the momenta, the Casimirs and the entropy."""
+        return TORQUE_FREE_LAWS
 
     def external_torque(self, x) -> jax.Array | None:
         """Return the external torque at a state, shape (n,), at a fixed time and attitude; None if none acts."""
@@ -229,11 +260,6 @@ class SystemInterface(Geometry):
         """
         return self.external_torque(x)
 
-    @property
-    def torque_entropy_law(self) -> LawName:
-        """Law of the entropy under what acts from outside alone: "conserved", or "nondecreasing" if it heats."""
-        return "conserved"
-
     def drop_torque(self) -> Self:
         """Return the system without its external torque."""
         return self
@@ -245,53 +271,52 @@ class SystemInterface(Geometry):
 
     # -- spins ----------------------------------------------------------------------------------------------------
 
-    def solve_rotation(self, angles, v) -> jax.Array | None:
-        """Return u with ``u_i - angles_i x u_i = v_i`` at each spin, and ``u = v`` elsewhere; None without spins.
+    def solve_at_spins(self, x, dH, noise_rates, half_step, velocities: Sequence) -> jax.Array | None:
+        """Return u with ``u_i - half_step J_i u_i = v_i`` at each spin, and ``u = v`` elsewhere; None without spins.
+
+        J_i is the derivative by s_i, at the given gradient dH, of the velocity of spin i.
 
         Parameters
         ----------
-        angles : array, shape (sites, 3)
-        v : array, shape (n,)
+        x, dH : array, shape (n,)
+        noise_rates : array, shape (sites, 3) or (1, 3)
+            Angular velocities by noise (1 / time).
+        half_step : array, shape ()
+        velocities : sequence of arrays, shape (n,)
+            Summands of v.
         """
         return None
 
     # -- laws ---------------------------------------------------------------------------------------------------------
 
     @property
-    def dissipations(self) -> tuple[Dissipation, ...]:
-        """The summands of the dissipation; () without one."""
-        return () if self.dissipation is None else self.dissipation.terms
+    def total_dissipation(self) -> Dissipation:
+        """The dissipation; of a system without dissipation a sum of no terms, which does nothing."""
+        return ABSENT_DISSIPATION if self.dissipation is None else self.dissipation
 
     @property
     def preserved(self) -> tuple[Energy, ...]:
         """Functions that the dissipation, or one of its summands, has to preserve beside the energy."""
-        return () if self.dissipation is None else self.dissipation.preserve
+        return self.total_dissipation.preserve
 
     @property
     def energy_law(self) -> LawName | None:
         """ "conserved", "nonincreasing" under double-bracket dissipation, or None where there is no guarantee."""
-        return "conserved" if self.dissipation is None else self.dissipation.energy_law
+        return self.total_dissipation.energy_law
 
     @property
     def entropy_law(self) -> LawName | None:
         """ "nondecreasing", "conserved", or None where there is no entropy or no guarantee."""
-        if self.entropy is None:
-            return None
-        return "conserved" if self.dissipation is None else self.dissipation.entropy_law
+        return None if self.entropy is None else self.total_dissipation.entropy_law
 
     def casimirs(self) -> dict[str, Energy]:
         """Return the known Casimirs of the Poisson structure, by name."""
         return {}
 
     @property
-    def has_all_casimirs(self) -> bool:
-        """True if every Casimir is known to be a function of :meth:`casimirs`."""
-        return False
-
-    @property
-    def orbit_levels(self) -> tuple[int, frozenset[str]]:
-        """Number of momenta that the group acts on, and names of the Casimirs whose common levels are the orbits."""
-        return self.body_dim, frozenset(self.casimirs())
+    def orbit_levels(self) -> OrbitLevels:
+        """Casimirs whose common levels are the orbits of the group, and whether all Casimirs are known."""
+        return OrbitLevels(self.body_dim, frozenset(self.casimirs()))
 
     @property
     def surface(self) -> Surface | None:
@@ -333,19 +358,10 @@ class SystemInterface(Geometry):
         is_complex = self.space is not None and self.space.dtype.kind == "c"
         return EngineHints(can_unroll=is_smooth and not is_complex, is_smooth=is_smooth)
 
-    def sparsity_pattern(self) -> scipy.sparse.csr_array | None:
-        """Return the sparsity pattern of the Jacobian of the field, shape (n, n); None if it is not known.
-
-        It holds for discrete gradients too. Large systems with a pattern are solved by sparse Newton iteration.
-        """
-        return None
-
-    def residual_weights(self, x) -> jax.Array:
-        """Return factors, shape (n,), that make the components of the field nearly linear in the state.
-
-        Newton's method solves the equations of a stiff step multiplied by these factors.
-        """
-        return jnp.ones_like(x)
+    @property
+    def sparse_newton(self) -> SparseNewton:
+        """Functions for Newton's method with a sparse Jacobian, which solves large systems with a known pattern."""
+        return SparseNewton()
 
     def component_scales(self, k) -> jax.Array:
         """Return the scale of each component of slopes, shape (..., n), for finite differences: the largest of all."""

@@ -155,10 +155,11 @@ def _memoized_verdicts(system: SystemInterface) -> dict[str, bool | None]:
 
 def _conservation_verdicts(system: SystemInterface, near=None) -> dict[str, bool | None]:
     """Return whether each function is conserved, by construction or by a test; None if undecided."""
-    claimed, torque_free = invariants_by_construction(system), system.torque_invariant_casimirs
+    claimed, torque = invariants_by_construction(system), system.torque_laws
+    torque_free = system.casimirs().keys() - torque.changed_casimirs
     unclaimed = {name: f for name, f in named_functions(system).items() if name not in claimed}
     # a test says nothing of functions that a torque changes: the torque may be zero at the tested times only
-    testable = {name: f for name, f in unclaimed.items() if not system.torque_name or name in torque_free}
+    testable = {name: f for name, f in unclaimed.items() if not torque.name or name in torque_free}
     with jax.ensure_compile_time_eval():  # JAX may be tracing something else
         verdicts = [False] * len(testable) if is_traced(system) else conserves(system, tuple(testable.values()), near)
     tested = dict(zip(testable, verdicts, strict=True))
@@ -167,9 +168,8 @@ def _conservation_verdicts(system: SystemInterface, near=None) -> dict[str, bool
 
 def invariants_by_construction(system: SystemInterface) -> frozenset[str]:
     """Return the names of the functions that are conserved by construction and need no test."""
-    return frozenset(
-        {*system.momentum_maps, *(system.torque_invariant_casimirs if dissipation_keeps_casimirs(system) else ())}
-    )
+    constant_casimirs = system.casimirs().keys() if dissipation_keeps_casimirs(system) else frozenset()
+    return frozenset(system.momentum_maps) | (constant_casimirs - system.torque_laws.changed_casimirs)
 
 
 def recorded_invariants(system: SystemInterface) -> dict[str, tuple[Energy, bool | None]]:
@@ -235,7 +235,7 @@ class _InnerEnergy(Energy):
 
 def systems_at_test_times(system: System) -> list[System]:
     """Return the system frozen at each of :data:`TEST_TIMES`, and at a random attitude if a torque needs one."""
-    if not system.needs_attitude:
+    if not system.torque_laws.needs_attitude:
         return [system.at_time(t) for t in TEST_TIMES]
     assert system.matrix_group is not None
     attitudes = system.matrix_group.random(0, (len(TEST_TIMES),), scale=1.0)

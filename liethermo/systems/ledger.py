@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -20,12 +19,13 @@ from manifolds.structures.poisson import ProductPoisson
 from ..dissipation.base import LawName, SkewFriction
 from ..dissipation.checks import checked_semidefinite
 from ..errors import InputError
-from ..functions.arguments import ConstantFunction, LastArgumentIgnored, required_argument_count
 from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers, require_condition
 from ..functions.energy import Energy, Quadratic
+from ..functions.time_span import ConstantFunction, LastArgumentIgnored, required_argument_count
 from ..tracing.interpret import evaluate_at_points
 from .base import System
+from .domain import Domain
 from .evolution import entropy_component
 
 LEDGER_DIM = 3
@@ -42,8 +42,6 @@ class LedgerSystem(System):
     friction: Callable | None
     external: Callable | None
     heat_power: Callable | None
-
-    domain: ClassVar[str] = "a positive temperature"
 
     def _set_forces(
         self, friction, external, heat_power, parts: tuple[tuple[int, ...], ...], at: str
@@ -183,12 +181,13 @@ class LedgerSystem(System):
 
     # -- checks -------------------------------------------------------------------------------------------------------
 
-    def outside(self, x) -> str:
+    @property
+    def domain(self) -> Domain:
+        return Domain("a positive temperature", self._why_outside, margin=self.temperature)
+
+    def _why_outside(self, x) -> str:
         T = float(evaluate_at_points(_temperature, self, np.atleast_2d(x)).min())
         return "" if T > 0.0 else f"the temperature -dL/dS is {T:.4g}: it has to be positive"
-
-    def domain_margin(self, x):
-        return self.temperature(x)
 
     def specific_residuals(self, x) -> dict[str, jax.Array]:
         arguments = self.split_state(x)

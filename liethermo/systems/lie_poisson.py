@@ -21,6 +21,7 @@ from ..tracing.caching import memoize
 from ..tracing.interpret import evaluate_at_points
 from .baths import BathEntropy, HeatBaths
 from .body_states import checked_velocity, entropies_of_temperatures, is_given_by_velocity, momentum_of_velocity
+from .interface import TORQUE_FREE_LAWS, OrbitLevels, TorqueLaws
 from .torque import (
     MAX_ARGUMENTS,
     MAX_ARGUMENTS_WITHOUT_ATTITUDE,
@@ -29,6 +30,7 @@ from .torque import (
     check_torque,
     evaluate_torque,
     torque_free_components,
+    torque_name,
 )
 
 
@@ -146,11 +148,11 @@ class LiePoissonSystem(TorqueSystem):
 
     def _field_without_torque(self, x, dH, dS, dL):
         # all forces that are coadjoint actions are computed by one action, ad*_dH (x + F)
-        if self.dissipation is None or self.dissipation.added_momentum(dH, jnp.zeros_like(dH)) is None:
+        if self.total_dissipation.added_momentum(dH, jnp.zeros_like(dH)) is None:
             return super()._field_without_torque(x, dH, dS, dL)
         action = self.algebra.action(dH)
         bracket = jnp.zeros_like(dH) if dS is None else action.bracket(dS)
-        return action.ad_star(x + self.dissipation.added_momentum(dH, bracket))
+        return action.ad_star(x + self.total_dissipation.added_momentum(dH, bracket))
 
     @property
     def inertia(self) -> np.ndarray | None:
@@ -232,19 +234,17 @@ class LiePoissonSystem(TorqueSystem):
         self.torque_arguments = None
 
     @property
-    def has_impulse(self) -> bool:
-        n_momenta = self.algebra.dim if self.group is None else self.group.dim
-        return self.torque is not None and not set(range(n_momenta)) <= set(self.torque_free_components)
-
-    @property
-    def torque_invariant_casimirs(self) -> frozenset[str]:
+    def torque_laws(self) -> TorqueLaws:
         if self.torque is None:
-            return super().torque_invariant_casimirs
-        return _casimirs_of_components(self.algebra, self.algebra.basis_names, self.torque_free_components)
-
-    @property
-    def needs_attitude(self) -> bool:
-        return self.torque is not None and max(self.torque_argument_counts) > MAX_ARGUMENTS_WITHOUT_ATTITUDE
+            return TORQUE_FREE_LAWS
+        n_momenta = self.algebra.dim if self.group is None else self.group.dim
+        free, names = self.torque_free_components, self.algebra.basis_names
+        return TorqueLaws(
+            torque_name(self.torque),
+            has_impulse=not set(range(n_momenta)) <= set(free),
+            needs_attitude=max(self.torque_argument_counts) > MAX_ARGUMENTS_WITHOUT_ATTITUDE,
+            changed_casimirs=frozenset(self.momentum_casimirs()) - _casimirs_of_components(self.algebra, names, free),
+        )
 
     def _torque_at(self, x, t, attitude):
         if attitude is not None:  # without it XLA crashes on products of many such matrices with vectors
@@ -270,14 +270,12 @@ class LiePoissonSystem(TorqueSystem):
         return _leading_casimirs(self.algebra, self.algebra.basis_names)
 
     @property
-    def has_all_casimirs(self) -> bool:
-        return _spans_all_casimirs(self.algebra)
-
-    @property
-    def orbit_levels(self) -> tuple[int, frozenset[str]]:
-        if self.group is None:
-            return super().orbit_levels
-        return self.group.dim, _casimirs_of_first(self.algebra, self.algebra.basis_names, self.group.dim)
+    def orbit_levels(self) -> OrbitLevels:
+        n_momenta, casimirs, _ = super().orbit_levels
+        if self.group is not None:
+            n_momenta = self.group.dim
+            casimirs = _casimirs_of_first(self.algebra, self.algebra.basis_names, n_momenta)
+        return OrbitLevels(n_momenta, casimirs, _spans_all_casimirs(self.algebra))
 
 
 def _resolve_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str | None) -> str | None:

@@ -13,6 +13,7 @@ from manifolds._pytree_module import forward_to
 from ..dissipation.base import LiftedDissipation, LiftedGeometry
 from ..functions.energy import Energy
 from .base import System
+from .domain import Domain
 from .interface import EngineHints
 
 
@@ -62,14 +63,19 @@ class LiftedSystem(System):
     def casimirs(self) -> dict[str, Energy]:
         return {name: self.extend(C) for name, C in self.inner.casimirs().items()}
 
-    def outside(self, x) -> str:
-        return self.inner.outside(x[..., : self.inner.dim])
+    @property
+    def domain(self) -> Domain:
+        n, domain = self.inner.dim, self.inner.domain
+        return Domain(
+            domain.description,
+            lambda x: self._inner_at_first(x).domain.why_outside(x[..., :n]),
+            lambda x: self._inner_at_first(x).domain.why_singular(x[..., :n]),
+            None if domain.margin is None else lambda x: self.inner_at(x).domain.margin_at(x[..., :n]),
+        )
 
-    def why_singular(self, x) -> str:
-        return self.inner.why_singular(x[..., : self.inner.dim])
-
-    def domain_margin(self, x):
-        return self.inner_at(x).domain_margin(x[..., : self.inner.dim])
+    def _inner_at_first(self, x) -> System:
+        """Return the inner system as it acts at the first of several states, shape (..., n), that are not traced."""
+        return self.inner
 
     @property
     def velocity_functions(self):
@@ -85,10 +91,7 @@ class LiftedSystem(System):
     def hints(self) -> EngineHints:
         return self.inner.hints._replace(is_smooth=super().hints.is_smooth)
 
-    torque_name = forward_to("inner")
-    has_impulse = forward_to("inner")
-    torque_invariant_casimirs = forward_to("inner")
-    has_all_casimirs = forward_to("inner")
+    torque_laws = forward_to("inner")
     orbit_levels = forward_to("inner")
     joint_ranges = forward_to("inner")
     surface = forward_to("inner")

@@ -23,7 +23,7 @@ from ..functions.gradients import EPS
 from ..tracing.interpret import evaluate_at_points
 from .base import System
 from .conservation import dissipation_keeps_casimirs
-from .invariants import resolve_invariants_near, systems_at_test_times
+from .invariants import resolve_invariants_near, stack_gradients, systems_at_test_times
 from .leaf_stability import has_definite_integral, retract
 
 REST_RTOL = 1e-7
@@ -133,9 +133,9 @@ def frozen_system(system: System, t: float | None) -> System:
         raise InputError(f"system must be a system such as lt.models.rigid_body(), got {type(system).__name__}")
     if is_traced(system):
         raise InputError("the parameters of the system are traced values. Call this function outside of jax.jit")
-    if system.needs_attitude:
+    if system.torque_laws.needs_attitude:
         raise InputError(
-            f"the torque {system.torque_name} depends on the attitude, so a momentum alone is not an equilibrium. "
+            f"the torque {system.torque_laws.name} depends on the attitude, so a momentum alone is not an equilibrium. "
             "Remove the torque, or write the attitude as part of the state"
         )
     if not system.is_driven:
@@ -154,9 +154,9 @@ def _explain_time_dependence(system: System) -> str:
     scale = np.abs(velocities).max()
     if np.abs(velocities - velocities[0]).max() <= EPS * 64 * scale:
         return ""
-    what = "a rate of the dissipation"
-    if system.energy.depends_on_time or system.torque_name:
-        what = "the energy" if system.energy.depends_on_time else f"the torque {system.torque_name}"
+    what, torque = "a rate of the dissipation", system.torque_laws.name
+    if system.energy.depends_on_time or torque:
+        what = "the energy" if system.energy.depends_on_time else f"the torque {torque}"
     return f"{what} of this {system.kind} depends on time"
 
 
@@ -172,18 +172,14 @@ def conserved_functions(system: System, x) -> dict[str, Energy]:
     system = resolve_invariants_near(system, system.state_array(x, batch=True))
     functions = system.functions()
     conserved = {name: g for name, g in functions.items() if name in system.first_integrals()}
-    if system.energy_law == "conserved" and not system.torque_name:
+    if system.energy_law == "conserved" and not system.torque_laws.name:
         conserved["energy"] = system.energy
     counters = counter_components(system)
     if not counters.size or not conserved:
         return conserved
-    gradients = evaluate_at_points(_gradients, tuple(conserved.values()), np.atleast_2d(np.asarray(x)))
+    gradients = evaluate_at_points(stack_gradients, tuple(conserved.values()), np.atleast_2d(np.asarray(x)))
     keeps = ~gradients[:, :, counters].any(axis=(0, 2))
     return {name: g for (name, g), keep in zip(conserved.items(), keeps, strict=True) if keep}
-
-
-def _gradients(functions: tuple[Energy, ...], x) -> jax.Array:
-    return jnp.stack([g.gradient(x) for g in functions])
 
 
 class Leaf(NamedTuple):
@@ -211,7 +207,7 @@ def leaf_at(
     rows, names = [], []
     if functions:
         samples = system.samples(3, scale=scale)
-        typical = np.linalg.norm(evaluate_at_points(_gradients, tuple(functions.values()), samples), axis=2)
+        typical = np.linalg.norm(evaluate_at_points(stack_gradients, tuple(functions.values()), samples), axis=2)
         typical_lengths = np.nanmedian(np.where(np.isfinite(typical), typical, np.nan), axis=0)
         for name, gradient, typical_length in zip(functions, gradients, typical_lengths, strict=True):
             length = np.linalg.norm(gradient)
@@ -236,9 +232,9 @@ def _regular_kernel(system: System, x: np.ndarray, scale: float) -> np.ndarray |
     None if all Casimirs are known, if x lies on a leaf of lower dimension, or if the dissipation leaves the leaf.
     """
     by_form = dissipation_keeps_casimirs(system)
-    if not by_form or system.torque_name or system.space is not None or system.baths is not None:
+    if not by_form or system.torque_laws.name or system.space is not None or system.baths is not None:
         return None
-    if system.has_all_casimirs or system.dim > MAX_TENSOR_DIM:
+    if system.orbit_levels.has_all_casimirs or system.dim > MAX_TENSOR_DIM:
         return None
     points = np.concatenate([x[None], system.samples(3, scale=scale)])
     tensors = evaluate_at_points(_poisson_tensor, system, points)

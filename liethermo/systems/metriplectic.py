@@ -14,9 +14,8 @@ from ..errors import InputError
 from ..functions.checks import traced_function_and_shape
 from .base import System
 from .baths import HeatBaths
-from .chart import ChartSystem
 from .check import MAX_MATRIX_DIM
-from .embedded import EmbeddedSystem
+from .embedded import ChartSystem, EmbeddedSystem
 
 
 class MetriplecticSystem(System):

@@ -16,12 +16,13 @@ from manifolds._pytree_module import replace_fields
 from manifolds.matrices.linear import adjoint
 
 from ..dissipation.adiabatic import ADIABATIC_LIMIT, AdiabaticJumps, adiabatic_parameter
-from ..dissipation.base import Dissipation, sum_dissipations
+from ..dissipation.base import Dissipation, dissipation_terms
 from ..dissipation.lindblad import LindbladJumps
 from ..dissipation.operators import HasMatrix, checked_hermitian, level_gap_rounding
 from ..dissipation.quantum import ThermalJumps
 from ..dissipation.steepest_ascent import SteepestEntropyAscent
 from ..errors import InputError
+from ..functions.bath_energy import BodyBathsEnergy
 from ..functions.density import (
     NEGATIVE_EIGENVALUE_LIMIT,
     IsolatedVonNeumann,
@@ -30,13 +31,12 @@ from ..functions.density import (
 )
 from ..functions.energy import Energy, Quadratic, Sum
 from ..functions.gradients import EPS
-from ..functions.with_baths import BodyBathsEnergy
 from .base import System
 from .baths import BathEntropy, HeatBaths, poisson_with_baths
 from .conditions import RunCondition
-from .density_states import checked_density_matrices, checked_parts, join_baths, tensor_with_identity
+from .domain import Domain
 from .equilibria import Equilibrium, steady_state
-from .hamiltonian import hamiltonian_energy
+from .hamiltonian import checked_density_matrices, checked_parts, hamiltonian_energy, join_baths, tensor_with_identity
 from .interface import EngineHints, InvariantVerdicts
 from .invariants import systems_at_test_times
 from .states import evaluate_batch
@@ -140,8 +140,7 @@ class QuantumSystem(System):
                 f"the entropy of a density matrix must be lt.VonNeumann(...), not {type(entropy).__name__}"
             )
         self.floor = entropy.floor
-        total = sum_dissipations(dissipation)
-        if total is None or all(isinstance(term, LindbladJumps) for term in total.terms):
+        if all(isinstance(term, LindbladJumps) for term in dissipation_terms(dissipation)):
             entropy = IsolatedVonNeumann(self.floor)  # the motion does not depend on it
         terms = [_bind_to_density(term, structure) for term in _dissipation_terms(dissipation)]
         if baths is not None and not any(isinstance(term, ThermalJumps) for term in terms):
@@ -164,9 +163,7 @@ class QuantumSystem(System):
     @property
     def is_driven(self) -> bool:
         """True if the Hamiltonian, a rate or a jump operator depends on time."""
-        return super().is_driven or (
-            self.time is None and self.dissipation is not None and self.dissipation.depends_on_time
-        )
+        return super().is_driven or (self.time is None and self.total_dissipation.depends_on_time)
 
     def at_time(self, t, attitude=None) -> QuantumSystem:
         """Return the system with its Hamiltonian and its rates frozen at the time t; an attitude plays no part."""
@@ -298,7 +295,11 @@ class QuantumSystem(System):
         """Return the completely mixed state, with baths at entropy zero."""
         return np.asarray(self.state(np.eye(self.structure.size) / self.structure.size))
 
-    def outside(self, x) -> str:
+    @property
+    def domain(self) -> Domain:
+        return Domain(why_outside=self._why_outside, why_singular=self._why_singular)
+
+    def _why_outside(self, x) -> str:
         if is_traced(self):
             return ""
         rho = self._density_matrices(x)
@@ -309,7 +310,7 @@ class QuantumSystem(System):
         min_eigenvalue = np.linalg.eigvalsh(rho)[:, 0].min()
         needs_logarithm = self._has_dissipation(ThermalJumps) or self._has_dissipation(SteepestEntropyAscent)
         limit = max(self.floor, NEGATIVE_EIGENVALUE_LIMIT if needs_logarithm else LINDBLAD_EIGENVALUE_LIMIT)
-        if self.dissipation is not None and min_eigenvalue < -limit:
+        if self.total_dissipation.terms and min_eigenvalue < -limit:
             return (
                 f"its density matrix has the eigenvalue {min_eigenvalue:.3g}, outside the cone of positive matrices: "
                 "a shorter step stays inside"
@@ -368,14 +369,13 @@ class QuantumSystem(System):
 
         At the end ``-ln rho - 1`` is a combination of the preserved gradients, which is fitted outside the kernel.
         """
-        assert self.dissipation is not None
-        ascent = next(term for term in self.dissipation.terms if isinstance(term, SteepestEntropyAscent))
+        ascent = next(term for term in self.total_dissipation.terms if isinstance(term, SteepestEntropyAscent))
         dS = VonNeumann(self._zero_eigenvalue_limit).gradient(x[: self.body_dim])
         dL = tuple(L.gradient(x) for L in ascent.preserve)
         affinity = np.asarray(self.structure.matrix(ascent.ascent_direction(self, x, self.energy.gradient(x), dS, dL)))
         return float(np.exp(np.linalg.eigvalsh(adjoint(kernel) @ affinity @ kernel)[-1] - 1.0))
 
-    def why_singular(self, x) -> str:
+    def _why_singular(self, x) -> str:
         if is_traced(self) or not self._has_dissipation(ThermalJumps):
             return ""
         x, rho = np.atleast_2d(x), self._density_matrices(x)
@@ -427,7 +427,7 @@ class QuantumSystem(System):
         return [vectors[:, p <= self._zero_eigenvalue_limit] for p, vectors in zip(*np.linalg.eigh(rho), strict=True)]
 
     def _has_dissipation(self, kind: type[Dissipation]) -> bool:
-        return self.dissipation is not None and any(isinstance(term, kind) for term in self.dissipation.terms)
+        return any(isinstance(term, kind) for term in self.total_dissipation.terms)
 
     @property
     def hints(self) -> EngineHints:
@@ -528,7 +528,7 @@ class QuantumSystem(System):
         """Return the trace, and without dissipation the purity too."""
         n = self.body_dim
         trace = Quadratic(np.zeros(n), np.where(np.arange(n) < self.structure.size, 1.0, 0.0))
-        if self.dissipation is None:
+        if not self.total_dissipation.terms:
             return {"tr(rho)": trace, "tr(rho^2)": Quadratic(np.full(n, 2.0))}
         return {"tr(rho)": trace if self.baths is None else trace.on(range(n))}
 
@@ -541,15 +541,15 @@ class QuantumSystem(System):
         systems, offset, terms = (self, other), 0, []
         sizes = [s.structure.size for s in systems]
         for k, s in enumerate(systems):
-            for term in () if s.dissipation is None else s.dissipation.terms:
+            for term in s.total_dissipation.terms:
                 if not isinstance(term, ThermalJumps):
                     raise InputError(
                         f"{type(term).__name__} of a part is none of a product: give it to the product as a whole"
                     )
                 operators = [tensor_with_identity(np.asarray(V), k, sizes) for V in term.operators]
                 terms.append(term.replace_operators(operators, term.bath + offset))
-            offset += 0 if s.baths is None else s.baths.number
-        if (self.baths is None) != (other.baths is None) and all(s.dissipation is not None for s in systems):
+            offset += s.dim - s.body_dim
+        if (self.baths is None) != (other.baths is None) and all(s.total_dissipation.terms for s in systems):
             raise InputError(
                 "the jumps of one part have a bath, but those of the other none: give baths to both parts or to neither"
             )
@@ -569,7 +569,7 @@ class QuantumSystem(System):
                 f"the interaction has shape {interaction.shape}, and the Hamiltonian ({self.structure.size}, "
                 f"{self.structure.size})"
             )
-        terms = () if self.dissipation is None else self.dissipation.terms
+        terms = self.total_dissipation.terms
         H = self._constant_hamiltonian() + interaction
         return QuantumSystem(H, list(terms) or None, self.baths, VonNeumann(self.floor), self.parts, self.names)
 
@@ -580,8 +580,7 @@ class QuantumSystem(System):
 
 
 def _dissipation_terms(dissipation) -> tuple[Dissipation, ...]:
-    total = sum_dissipations(dissipation)
-    terms = () if total is None else total.terms
+    terms = dissipation_terms(dissipation)
     for term in terms:
         if not isinstance(term, ThermalJumps | SteepestEntropyAscent | LindbladJumps):
             raise InputError(

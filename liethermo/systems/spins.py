@@ -17,23 +17,35 @@ from manifolds._pytree_module import replace_fields
 from manifolds.structures.poisson import ProductPoisson
 from manifolds.structures.spins import add_vectors, cross, cross_vectors, dot_vectors, scale_vectors, split_vectors
 
-from ..dissipation.base import Dissipation, LawName
-from ..dissipation.bath_conduction import BathConduction
-from ..dissipation.heating import Heating
+from ..dissipation.base import Dissipation
+from ..dissipation.heating import BathConduction, Heating
 from ..dissipation.landau_lifshitz import LandauLifshitz
 from ..errors import InputError
 from ..functions.checks import traced_function_and_shape
 from ..functions.energy import Energy
 from ..functions.magnetism.spin_energy import lattice_shape
 from ..functions.magnetism.spin_torques import check_spin_torque
-from ..functions.on_spaces import flatten_site_functions
-from ..functions.planes import energy_in_component_order, interaction_range, to_component_order, to_site_order
-from ..functions.spheres import HalfSumOfSquares, Spheres
+from ..functions.on_spaces import (
+    HalfSumOfSquares,
+    Spheres,
+    energy_in_component_order,
+    flatten_site_functions,
+    interaction_range,
+    to_component_order,
+    to_site_order,
+)
 from .base import System
 from .baths import HeatBaths, poisson_with_baths
+from .interface import TorqueLaws
 from .torque import TorqueSystem, torque_name
 
 SPIN_LENGTHS_NAME = "sum |s|^2 / 2"
+"""Name of the Casimir of spins."""
+
+MIN_DAMPING_FACTOR = 0.5
+"""Smallest factor of a spin in the equations that are solved spin by spin.
+
+It is below 1 only where a spin is turned away from its field, and would vanish in very long steps."""
 
 
 class SpinSystem(TorqueSystem):
@@ -113,7 +125,7 @@ class SpinSystem(TorqueSystem):
 
     def _field_without_torque(self, x, dH, dS, dL):
         # precession and damping of the spins are added before they are stored in a state
-        parts, spins, n = _split_damping(self.dissipation), self._spin_structure, self.body_dim
+        parts, spins, n = _split_damping(self.total_dissipation), self._spin_structure, self.body_dim
         if parts is None or spins is None:
             return super()._field_without_torque(x, dH, dS, dL)
         damping, heating, conduction = parts
@@ -132,20 +144,10 @@ class SpinSystem(TorqueSystem):
     # -- the torque -----------------------------------------------------------------------------------------------
 
     @property
-    def has_torque(self) -> bool:
-        return self.torque is not None or bool(self.power)
-
-    @property
-    def torque_name(self) -> str:
-        return torque_name((*(self.torque or ()), *self.power))
-
-    @property
-    def torque_invariant_casimirs(self) -> frozenset[str]:
-        return frozenset(self.casimirs())  # a torque s x w keeps every length
-
-    @property
-    def torque_entropy_law(self) -> LawName:
-        return "nondecreasing" if self.power else "conserved"
+    def torque_laws(self) -> TorqueLaws:
+        """Name and laws of torques and powers; no Casimir changes, since a torque ``s x w`` keeps every length."""
+        name = torque_name((*(self.torque or ()), *self.power))
+        return TorqueLaws(name, bool(name), entropy_law="nondecreasing" if self.power else "conserved")
 
     def _torque_at(self, x, t, attitude):
         s = x[: self.body_dim].reshape(*self.lattice, 3)
@@ -183,17 +185,28 @@ class SpinSystem(TorqueSystem):
         assert spins is not None
         return dot_vectors(spins.split_covectors(alpha), spins.split_covectors(v))
 
-    def solve_rotation(self, angles, v) -> jax.Array | None:
-        """Return u with ``u_i - angles_i x u_i = v_i`` at each spin, angles of shape (sites, 3), and u = v elsewhere.
+    def solve_at_spins(self, x, dH, noise_rates, half_step, velocities) -> jax.Array | None:
+        """Return u with ``u_i - half_step J_i u_i = v_i`` at each spin and u = v elsewhere, v the sum of velocities.
 
-        ``u = (v + a x v + (a . v) a) / (1 + |a|^2)``, as ``a . u = a . v``.
+        Noise, precession and damping turn s at the angular velocity ``w - gamma dH - lambda s x dH``, and damping has
+        the factor ``lambda s . dH`` besides. So ``c u - a x u = v`` with the angle a in half a step, which has the
+        solution ``u = (c v + a x v + (a . v) a / c) / (c^2 + |a|^2)``, as ``c a . u = a . v``.
         """
-        spins = self._spin_structure
+        spins, parts, n = self._spin_structure, _split_damping(self.total_dissipation), self.body_dim
         if spins is None:
             return None
-        a, r = split_vectors(angles), spins.split_covectors(v)
-        u = add_vectors(add_vectors(r, cross_vectors(a, r)), scale_vectors(dot_vectors(a, r), a))
-        return spins.join_state(scale_vectors(1.0 / (1.0 + dot_vectors(a, a)), u), v[self.body_dim :])
+        s, gradient, c = spins.split_covectors(x), spins.split_covectors(dH), jnp.ones(())
+        precession = scale_vectors(-half_step * spins.ratio.reshape(-1), gradient)
+        a = add_vectors(split_vectors(half_step * noise_rates), precession)
+        if parts is not None:
+            signs = 1.0 if parts.heating is None else parts.heating.temperature_signs(dH[n:])
+            rate = -half_step * signs * parts.damping.rate.reshape(-1)
+            a = add_vectors(a, scale_vectors(rate, cross_vectors(s, gradient)))
+            c = jnp.maximum(1.0 + rate * dot_vectors(s, gradient), MIN_DAMPING_FACTOR)
+        v = functools.reduce(add_vectors, map(spins.split_covectors, velocities))
+        u = add_vectors(add_vectors(scale_vectors(c, v), cross_vectors(a, v)), scale_vectors(dot_vectors(a, v) / c, a))
+        others = sum(velocity[n:] for velocity in velocities)
+        return spins.join_state(scale_vectors(1.0 / (c * c + dot_vectors(a, a)), u), others)
 
     def largest_step(self, x, angle: float = 0.3, boltzmann: float = 0.0, t: float = 0.0) -> float:
         """Return the step (time) in which no spin turns by more than an ``angle``, in its field or by noise.
@@ -221,7 +234,7 @@ class SpinSystem(TorqueSystem):
         system = self.at_time(t)
         gradient, s = system.energy.gradient(state), np.asarray(state[:n]).reshape(-1, 3)
         field = np.linalg.norm(np.asarray(gradient[:n]).reshape(-1, 3), axis=1)
-        parts = _split_damping(self.dissipation)
+        parts = _split_damping(self.total_dissipation)
         rate = np.zeros(()) if parts is None else np.abs(np.asarray(parts.damping.rate)).ravel()
         damping_rate = rate * np.linalg.norm(s, axis=1)
         turning_rate = float((np.hypot(np.ravel(spins.ratio), damping_rate) * field).max())
@@ -290,7 +303,8 @@ def reorder_spins(system: System) -> ReorderedSystem | None:
     if type(system) is not SpinSystem:
         return None
     spins = system._spin_structure
-    is_reorderable = system.dissipation is None or _split_damping(system.dissipation) is not None
+    dissipation = system.total_dissipation
+    is_reorderable = not dissipation.terms or _split_damping(dissipation) is not None
     if not is_reorderable or spins is None or spins.is_component_major or system.is_driven:
         return None
     count = spins.count
@@ -339,14 +353,13 @@ class _DampingParts(NamedTuple):
     conduction: tuple[BathConduction, ...]
 
 
-def _split_damping(dissipation: Dissipation | None) -> _DampingParts | None:
+def _split_damping(dissipation: Dissipation) -> _DampingParts | None:
     """Return a dissipation as its damping and its heat conduction between baths, if any; None for another dissipation.
 
     It is None for subclasses, whose force may differ.
     """
-    terms = () if dissipation is None else dissipation.terms
-    conduction = tuple(term for term in terms if type(term) is BathConduction)
-    others = [term for term in terms if type(term) is not BathConduction]
+    conduction = tuple(term for term in dissipation.terms if type(term) is BathConduction)
+    others = [term for term in dissipation.terms if type(term) is not BathConduction]
     if len(others) != 1:
         return None
     heating = others[0] if type(others[0]) is Heating else None

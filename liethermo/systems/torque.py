@@ -15,12 +15,12 @@ import manifolds as mf
 from manifolds._pytree_module import replace_fields
 
 from ..errors import FunctionError, InputError
-from ..functions.arguments import required_argument_count
-from ..functions.piecewise import is_spline
+from ..functions.time_span import is_spline, required_argument_count
 from ..tracing.interpret import MAX_UNROLLED_DIM, vanishing_entry_indices
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import TracedFunction, trace_callables_and_result_shapes
 from .base import System
+from .interface import TorqueLaws
 
 
 class TorqueSystem(System):
@@ -37,39 +37,36 @@ class TorqueSystem(System):
     torque_arguments: tuple[jax.Array, jax.Array | None] | None
 
     @property
-    def has_torque(self) -> bool:
-        """True if something acts on the system from outside."""
-        return self.torque is not None
-
-    @property
-    def torque_name(self) -> str:
-        return "" if self.torque is None else torque_name(self.torque)
+    @abstractmethod
+    def torque_laws(self) -> TorqueLaws:
+        """Name of what acts on the system from outside, and its laws."""
 
     @property
     def is_driven(self) -> bool:
-        return super().is_driven or (self.has_torque and self.torque_arguments is None)
+        return super().is_driven or (self.torque_laws.name != "" and self.torque_arguments is None)
 
     def at_time(self, t, attitude=None):
         system = super().at_time(t)
-        if not self.has_torque:
+        if not self.torque_laws.name:
             return system
         arguments = jnp.asarray(t, dtype=jnp.float64), None if attitude is None else jnp.asarray(attitude)
         return replace_fields(system, torque_arguments=arguments)
 
     def drop_torque(self):
-        if not self.has_torque:
+        if not self.torque_laws.name:
             return self
         return replace_fields(self, torque=None, torque_arguments=None)
 
     def external_torque(self, x):
-        if not self.has_torque:
+        laws = self.torque_laws
+        if not laws.name:
             return None
         t, attitude = (None, None) if self.torque_arguments is None else self.torque_arguments
-        if t is None or (attitude is None and self.needs_attitude):
-            what = "time" if not self.needs_attitude else "time and the attitude"
+        if t is None or (attitude is None and laws.needs_attitude):
+            what = "time and the attitude" if laws.needs_attitude else "time"
             raise InputError(
-                f"the torque {self.torque_name} is known at a {what}: take system.at_time(t"
-                f"{', attitude' if self.needs_attitude else ''})"
+                f"the torque {laws.name} is known at a {what}: take system.at_time(t"
+                f"{', attitude' if laws.needs_attitude else ''})"
             )
         torque = self._torque_at(x, t, attitude)
         return jnp.pad(torque, (0, self.dim - len(torque)))

@@ -11,7 +11,7 @@ from .interface import SystemInterface
 
 def dissipation_velocities(system: SystemInterface, x, dH, dS, dL) -> list[jax.Array | None]:
     """Return the velocity of each dissipation; None for a dissipation that acts as a torque."""
-    terms = terms_with_preserved_values(system.dissipations, dL)
+    terms = terms_with_preserved_values(system.total_dissipation.terms, dL)
     return [term.velocity(system, x, dH, dS, term_dL) for term, term_dL in terms]
 
 
@@ -31,11 +31,10 @@ def is_torque_free(system: SystemInterface) -> bool:
 
 def has_generator(system: SystemInterface) -> bool:
     """Return whether :func:`generator_field` computes the motion without the gradient of the entropy."""
-    return system.dissipation is not None and system.dissipation.has_generator
+    return system.total_dissipation.has_generator
 
 
 def generator_field(system: SystemInterface, x) -> jax.Array:
     """Return the vector field at x, shape (n,), by the generator of the dissipation, without the entropy."""
-    assert system.dissipation is not None
     dH = system.energy.gradient(x)
-    return system.poisson.sharp(x, dH) + system.dissipation.generator_field(system, x, dH)
+    return system.poisson.sharp(x, dH) + system.total_dissipation.generator_field(system, x, dH)

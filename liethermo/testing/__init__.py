@@ -5,14 +5,12 @@ Each ``check_*`` tests an object as the registered ones are tested. It returns a
 :mod:`manifolds.testing`.
 """
 
-from manifolds._names import public_dir
+from manifolds._arguments import public_dir
 from manifolds.testing import PropertyError, Report
 
-from .dissipations import check_dissipation
 from .equilibrium import check_equilibrium
-from .methods import check_method
 from .relations import RELATIONS, check_relations
-from .systems import check_system
+from .suites import check_dissipation, check_method, check_system
 
 __all__ = [
     "RELATIONS",

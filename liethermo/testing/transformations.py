@@ -17,6 +17,7 @@ from manifolds.structures.poisson import PoissonBySharp, ProductPoisson
 
 from ..dissipation.base import Dissipation, DissipationSum, LiftedDissipation, LiftedGeometry
 from ..functions.energy import Energy, Function, Pullback, Quadratic, Sum
+from ..runs.named_parameters import named_parameters, replace_parameters
 from ..systems import LiePoissonSystem, MetriplecticSystem, System
 from ..systems.invariants import find_preserved_names
 
@@ -220,13 +221,13 @@ class _ScaledDissipation(LiftedDissipation):
         return None if velocity is None else self.fraction * velocity
 
 
-def sum_of_two_halves(dissipation: Dissipation) -> Dissipation:
-    """Return the dissipation as the sum of two with half of the rate each."""
-    rate = getattr(dissipation, "rate", None)
-    if isinstance(rate, jax.Array | np.ndarray | float):
-        half = eqx.tree_at(lambda d: d.rate, dissipation, rate / 2)
-        return half + half
-    half = _ScaledDissipation.lift_terms(dissipation, lambda L: L, jnp.asarray(0.5))
+def sum_of_two_halves(system: System) -> Dissipation:
+    """Return the dissipation of a system as the sum of two with half of the rate each."""
+    rate = named_parameters(system).get("dissipation.rate")
+    if rate is not None:
+        half = replace_parameters(system, {"dissipation.rate": rate / 2}).dissipation
+    else:
+        half = _ScaledDissipation.lift_terms(system.dissipation, lambda L: L, jnp.asarray(0.5))
     assert half is not None
     return DissipationSum((*half.terms, *half.terms))
 

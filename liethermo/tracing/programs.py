@@ -1,18 +1,21 @@
-"""A cache of programs compiled by XLA, found by their content; the least recently used are unloaded.
+"""Caches of programs: those compiled by XLA, found by their content, and machine code on disk.
 
 A compiled program takes several hundred memory maps of the 65,530 that Linux grants a process, and ``jax.jit`` keeps
-thousands of programs. Programs that take long to compile are also kept on disk, for other processes
-(:mod:`.code_cache`).
+thousands of programs, so the least recently used are unloaded. What takes long to compile is also kept on disk for
+other processes, in files and folders that only this user can have written.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import os
+import stat
 import time
 import zlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -23,9 +26,116 @@ import numpy as np
 from jax.experimental import serialize_executable
 
 from manifolds._arrays import is_traced
+from manifolds.errors import warn
 
+from .. import disk
 from .caching import LRUCache
-from .code_cache import host_processor, read_machine_code, write_machine_code
+
+
+class CacheWarning(UserWarning):
+    """Warning that machine code cannot be cached safely, so that every process compiles it again."""
+
+
+CHECKSUM_BYTES = 32
+"""Length in bytes of the checksum at the start of a file, which shows that a file was cut short."""
+
+MAX_FILE_BYTES = 2**28
+"""Largest size in bytes of a file that is read."""
+
+SAFE_OPEN_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
+"""Flags that refuse to open a link and do not wait for the other end of a pipe."""
+
+
+def cache_folder() -> Path | None:
+    """Return the folder ``$LIETHERMO_CACHE`` or one in the user's cache directory; None if there is none."""
+    if user_folder := os.environ.get("LIETHERMO_CACHE"):
+        return Path(user_folder)
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "liethermo"
+    except RuntimeError:  # no HOME, and no entry for the user
+        return None
+
+
+@functools.cache
+def host_processor() -> tuple[str, str, str]:
+    """Return the LLVM names of this machine: target triple, CPU and features."""
+    import llvmlite.binding as llvm
+
+    return llvm.get_process_triple(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+
+
+def read_machine_code(name: str, suffix: str = ".o") -> bytes | None:
+    """Return the machine code written under ``name``; None if it is missing, damaged, or may be another user's."""
+    folder = _trusted_folder()
+    if folder is None:
+        return None
+    try:
+        with open(
+            folder / f"{name}{suffix}", "rb", opener=lambda path, flags: os.open(path, flags | SAFE_OPEN_FLAGS)
+        ) as file:
+            file_status = os.fstat(file.fileno())
+            if not stat.S_ISREG(file_status.st_mode) or file_status.st_size > MAX_FILE_BYTES:
+                return None
+            if reason := _why_untrusted(file_status):
+                _warn_untrusted(str(folder / f"{name}{suffix}"), reason)
+                return None
+            content = file.read()
+    except (OSError, ValueError):
+        return None
+    checksum, code = content[:CHECKSUM_BYTES], content[CHECKSUM_BYTES:]
+    return code if code and checksum == hashlib.sha256(code).digest() else None
+
+
+def write_machine_code(name: str, code: bytes, suffix: str = ".o") -> None:
+    """Write machine code to the cache under ``name``, if there is a folder that can be used."""
+    folder = _trusted_folder()
+    if folder is not None:
+        with contextlib.suppress(OSError):
+            disk.write_atomically(folder / f"{name}{suffix}", hashlib.sha256(code).digest() + code, mode=0o600)
+            disk.remove_abandoned_files(folder, f"{name}{suffix}")
+
+
+def _trusted_folder() -> Path | None:
+    """Return the cache folder, created if necessary; None if it cannot be used or others might write to it."""
+    folder = cache_folder()
+    if folder is None:
+        return None
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir(mode=0o700)
+        folder_status = os.lstat(folder)
+    except (OSError, ValueError):
+        return None
+    if stat.S_ISLNK(folder_status.st_mode):
+        _warn_untrusted(str(folder), "it is a link")
+    elif not stat.S_ISDIR(folder_status.st_mode):
+        _warn_untrusted(str(folder), "it is not a folder")
+    elif reason := _why_untrusted(folder_status):
+        _warn_untrusted(str(folder), reason)
+    else:
+        return folder
+    return None
+
+
+def _why_untrusted(status: os.stat_result) -> str:
+    """Return why a file or folder may be another user's; empty if it is this user's alone."""
+    if not hasattr(os, "geteuid"):
+        return ""
+    if status.st_uid != os.geteuid():
+        return "it belongs to another user"
+    return "others may write to it" if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH) else ""
+
+
+@functools.cache
+def _warn_untrusted(path: str, reason: str) -> None:
+    """Warn, once for each path, that machine code is not cached there."""
+    warn(
+        f"machine code is not kept in {path}: {reason}, and the code there could do anything in your name. It is "
+        "compiled in memory instead. Set LIETHERMO_CACHE to a folder of your own (chmod 700)",
+        CacheWarning,
+    )
+
 
 MAX_CACHED_PROGRAMS = 48
 """Largest number of compiled programs in memory; each takes at most 500 memory maps."""
@@ -40,13 +150,24 @@ MAX_CACHED_SUBPROGRAMS = 512
 _subprogram_cache: LRUCache[Callable] = LRUCache(MAX_CACHED_SUBPROGRAMS)
 
 
+LOOP_XLA_OPTIONS = {
+    "xla_disable_hlo_passes": "cse_barrier_expander",
+    "xla_cpu_enable_concurrency_optimized_scheduler": False,
+}
+"""Options for a program that runs often, such as the loop of the steps.
+
+XLA drops optimisation barriers on the CPU before it fuses loops, and then computes a field once for each place that
+uses it; without this pass they hold. Loops over some thousand numbers are shorter than it takes to start one on another
+core, so they run one after another. Each loop over a large array still uses all cores.
+"""
+
 UNOPTIMISED_XLA_OPTIONS = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 """Options for a program that runs once or twice: optimising it, or fusing its loops, takes longer than it saves."""
 
 
 def jit_cached(function: FunctionT) -> FunctionT:
     """Decorator: compile a function of pytrees; arrays are its arguments, and other leaves are part of the program."""
-    return _jit_with_options(function, None)
+    return _jit_with_options(function, LOOP_XLA_OPTIONS)
 
 
 def jit_unoptimised(function: FunctionT) -> FunctionT:
@@ -107,9 +228,10 @@ def _compile(function: Callable, arguments: tuple, options: dict | None) -> Call
     call Python, or that run on accelerators or on several devices, are not cached, nor any if JAX's own cache is on:
     a program that comes from there cannot be written again.
     """
-    jitted = jax.jit(function, compiler_options=options)
     devices = jax.devices()
-    if len(devices) > 1 or devices[0].platform != "cpu" or getattr(jax.config, "jax_compilation_cache_dir"):  # noqa: B009
+    is_cpu = devices[0].platform == "cpu"
+    jitted = jax.jit(function, compiler_options=options if is_cpu else None)
+    if len(devices) > 1 or not is_cpu or getattr(jax.config, "jax_compilation_cache_dir"):  # noqa: B009
         return jitted
     lowered = jitted.lower(arguments)
     text = lowered.as_text()

@@ -8,9 +8,8 @@ from functools import cached_property
 import jax
 import jax.numpy as jnp
 
-from .._names import checked_names
+from .._arguments import check_memory, checked_names
 from .._pytree_module import forward_to
-from .._sizes import check_memory
 from .lie_algebra import LieAlgebra
 
 

@@ -15,14 +15,14 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from .._sizes import check_memory, checked_size
+from .._arguments import check_memory, checked_size
 from ..errors import ParameterError
 from . import matrix_bases
-from ._null_space import rational_null_space
+from ._subspaces import rational_null_space
+from .blocks import direct_sum, semidirect_sum
 from .lie_algebra import LieAlgebra
 from .matrix_algebra import ClassicalData, MatrixAlgebra
 from .matrix_bases import MatrixBasis
-from .sums import direct_sum, semidirect_sum
 
 _registry: list[tuple[Callable[..., LieAlgebra], tuple, dict]] = []
 

@@ -15,9 +15,9 @@ import numpy as np
 
 from ..errors import LieAlgebraError
 from . import _solvable_types as solvable
-from ._jordan import distinct_eigenvalues
-from ._solvable_types import Summand
+from ._solvable_types import Summand, distinct_eigenvalues
 from ._subspaces import complement, coordinates, intersection, is_exact, null_space, products, row_space
+from .blocks import direct_sum
 from .lie_algebra import LieAlgebra
 from .patera import CATALOGUE, patera
 from .substructure import (
@@ -30,7 +30,6 @@ from .substructure import (
     radical,
     working_constants,
 )
-from .sums import direct_sum
 
 MAX_TYPE_DIM = 5
 """Largest dimension of an indecomposable summand that has a name in the list."""

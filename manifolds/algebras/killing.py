@@ -5,37 +5,12 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
-from .._arrays import real_components
-from ..errors import ComponentError, LieAlgebraError, ShapeError
-from ._basis_scaling import STRUCTURE_TOLERANCE
+from ..errors import LieAlgebraError
+from .axioms import STRUCTURE_TOLERANCE
 
 
 def killing_form_of(constants: np.ndarray) -> np.ndarray:
     return np.einsum("acd,bdc->ab", constants, constants, optimize=True)
-
-
-def trilinear_form(algebra, form=None) -> np.ndarray:
-    """Return the covariant tensor ``c(x, y, z) = form(x, [y, z])`` of an inner product [BFM Remark 3.3].
-
-    Parameters
-    ----------
-    algebra : LieAlgebra
-    form : array, shape (dim, dim), optional
-        By default the Killing form, for which the tensor is totally skew.
-
-    Returns
-    -------
-    ndarray, shape (dim, dim, dim)
-        ``c[a, b, d] = form(e_a, [e_b, e_d])``.
-    """
-    if not hasattr(algebra, "killing_form"):
-        raise LieAlgebraError(f"algebra must be a manifolds.LieAlgebra, such as mf.so(3), got {algebra!r}")
-    form = np.asarray(real_components(algebra.killing_form() if form is None else form, algebra.dim, "the form"))
-    if form.shape != (algebra.dim, algebra.dim):
-        raise ShapeError(f"the form on {algebra.name} must have shape ({algebra.dim}, {algebra.dim}), got {form.shape}")
-    if not np.isfinite(form).all():
-        raise ComponentError(f"the form on {algebra.name} must be finite, not {form.tolist()}")
-    return np.einsum("ae,bde->abd", form, np.asarray(algebra.structure_constants))
 
 
 def row_space_basis(rows: np.ndarray) -> np.ndarray:

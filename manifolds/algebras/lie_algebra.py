@@ -16,18 +16,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._arguments import checked_names
 from .._arrays import is_traced, real_array, real_components, square_matrices
-from .._names import checked_names
-from ..errors import LieAlgebraError, ParameterError
-from ._basis_scaling import STRUCTURE_TOLERANCE, balance_constants
+from ..errors import ComponentError, LieAlgebraError, ParameterError, ShapeError
 from ._rational import RationalArray, rational_array
-from .actions import Action, AdMatrixAction, Operator, terms_to_unroll, unrolled_bracket
-from .axioms import check_axioms, checked_constants, constants_and_matrices, real_columns
-from .bracket_table import constants_and_names
+from .axioms import (
+    STRUCTURE_TOLERANCE,
+    balance_constants,
+    check_axioms,
+    checked_constants,
+    constants_and_matrices,
+    real_columns,
+)
+from .bracket_table import algebra_html, constants_and_names
 from .casimirs import DEFAULT_MAX_DEGREE, casimirs, casimirs_up_to, check_invariant, leading_casimirs
-from .display import algebra_html
 from .killing import cartan_involution_of, killing_form_of, row_space_basis
 from .polynomial_casimirs import casimir_count
+from .structure import Action, AdMatrixAction, Operator, terms_to_unroll, unrolled_bracket
 from .structure_methods import CasimirInBasis, StructureMethods, constants_in_basis
 
 
@@ -578,3 +583,27 @@ def _read_only_copy(array: np.ndarray) -> np.ndarray:
     array = np.array(array)
     array.setflags(write=False)
     return array
+
+
+def trilinear_form(algebra: LieAlgebra, form=None) -> np.ndarray:
+    """Return the covariant tensor ``c(x, y, z) = form(x, [y, z])`` of an inner product [BFM Remark 3.3].
+
+    Parameters
+    ----------
+    algebra : LieAlgebra
+    form : array, shape (dim, dim), optional
+        By default the Killing form, for which the tensor is totally skew.
+
+    Returns
+    -------
+    ndarray, shape (dim, dim, dim)
+        ``c[a, b, d] = form(e_a, [e_b, e_d])``.
+    """
+    if not isinstance(algebra, LieAlgebra):
+        raise LieAlgebraError(f"algebra must be a manifolds.LieAlgebra, such as mf.so(3), got {algebra!r}")
+    form = np.asarray(real_components(algebra.killing_form() if form is None else form, algebra.dim, "the form"))
+    if form.shape != (algebra.dim, algebra.dim):
+        raise ShapeError(f"the form on {algebra.name} must have shape ({algebra.dim}, {algebra.dim}), got {form.shape}")
+    if not np.isfinite(form).all():
+        raise ComponentError(f"the form on {algebra.name} must be finite, not {form.tolist()}")
+    return np.einsum("ae,bde->abd", form, np.asarray(algebra.structure_constants))

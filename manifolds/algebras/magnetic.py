@@ -12,12 +12,11 @@ import numpy as np
 
 from .._arrays import real_components
 from ..errors import ParameterError
-from ..matrices.blocks import BlockDiagonal, Diagonal
-from .blocks import DirectSum
+from ..matrices.linear import BlockDiagonal, Diagonal
+from .blocks import MAX_DIM_BY_CONSTANTS, DirectSum, semidirect_sum
 from .bracket_algebra import BracketAlgebra
 from .lie_algebra import LieAlgebra
 from .matrix_algebra import MatrixAlgebra
-from .sums import MAX_DIM_BY_CONSTANTS, semidirect_sum
 
 MAX_FOLLOWED_CASIMIRS = 2
 """Number of Casimirs of g that are followed along a motion of its extension, where each gives two Casimirs."""

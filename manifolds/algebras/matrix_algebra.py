@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._arguments import check_memory
 from .._arrays import is_traced, real_components, square_matrices
 from .._pytree_module import forward_to
-from .._sizes import check_memory
 from ..errors import LieAlgebraError, ParameterError
-from ..matrices.blocks import Diagonal
+from ..matrices.linear import Diagonal
 from .bracket_algebra import BracketAlgebra
 from .lie_algebra import LieAlgebra
 from .matrix_bases import MatrixBasis

@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from ..errors import ParameterError
-from .formula import Formula, fill_in_parameters, is_integer_ratio
 from .lie_algebra import LieAlgebra
+from .polynomial import Formula, fill_in_parameters, is_integer_ratio
 
 Brackets = Mapping[tuple[int, int], Mapping[int, float]]
 Parameters = dict[str, float]

@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 
 from ..errors import JacobiError, LieAlgebraError
-from ._null_space import (
+from ._subspaces import (
     large_prime,
     numerical_null_space,
     numerical_rank,

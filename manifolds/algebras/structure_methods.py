@@ -13,9 +13,8 @@ import numpy as np
 from .._class_members import ListedType
 from ..errors import LieAlgebraError, ShapeError
 from . import substructure
-from ._null_space import numerical_rank, row_echelon
 from ._rational import rational_array
-from ._subspaces import fraction_rows, is_exact
+from ._subspaces import fraction_rows, is_exact, numerical_rank, row_echelon
 from .structure import AlgebraStructure
 
 

@@ -1,11 +1,18 @@
-"""Constructors of the classical matrix groups."""
+"""Constructors of the classical matrix groups, and connected subgroups that are spanned by given matrices."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._arrays import numeric_array
 from ..algebras import catalogue
-from ..matrices.linear import adjoint, newton_schulz_step
+from ..errors import ParameterError
+from ..matrices.linear import adjoint, newton_schulz_step, solve
 from . import closed_forms as closed
 from . import maps
 from .matrix_group import MatrixGroup, register
@@ -140,3 +147,123 @@ def Heisenberg(n: int = 1) -> MatrixGroup:
         closed.exp_heisenberg,
         closed.restore_heisenberg,
     )
+
+
+SUBALGEBRA_TOLERANCE = 1e-10
+"""Largest distance of a bracket of unit vectors from the subalgebra."""
+
+
+def subalgebra_basis(group: MatrixGroup, spanning_matrices) -> np.ndarray:
+    """Return orthonormal components of a basis of the subalgebra that matrices span, shape (k, dim of the group).
+
+    Parameters
+    ----------
+    group : MatrixGroup
+        The basis of its algebra must be orthogonal as matrices, all of one norm, as for so(n) and su(n).
+    spanning_matrices : array, shape (k, n, n)
+
+    Raises
+    ------
+    ParameterError
+        If the matrices are dependent, not in the algebra of the group, or do not span a subalgebra.
+    """
+    basis, matrices = group.algebra._require_basis(), np.asarray(numeric_array(spanning_matrices, "stabilizer"))
+    matrices = matrices.reshape(-1, *basis.shape[1:]) if matrices.size == 0 else matrices
+    if matrices.shape[1:] != basis.shape[1:]:
+        n = group.matrix_size
+        raise ParameterError(
+            f"the stabilizer in {group.name} must be matrices of shape (k, {n}, {n}), got {matrices.shape}"
+        )
+
+    def components(a):
+        return np.einsum("dij,...ij->...d", basis.conj(), a).real / (np.abs(basis[0]) ** 2).sum()
+
+    def matrix(c):
+        return np.einsum("...d,dij->...ij", c, basis)
+
+    directions = components(matrices)
+    residuals = np.abs(matrices - matrix(directions)).max(axis=(1, 2), initial=0.0)
+    if (residuals > SUBALGEBRA_TOLERANCE).any():
+        raise ParameterError(
+            f"matrix {int(np.argmax(residuals))} of the stabilizer is not in the algebra of {group.name}: it is "
+            f"{residuals.max():.2g} off"
+        )
+    if len(directions) and (rank := np.linalg.matrix_rank(directions)) < len(directions):
+        raise ParameterError(
+            f"the {len(directions)} matrices of the stabilizer in {group.name} span {rank} dimensions only: leave one "
+            "out"
+        )
+    rows = np.linalg.qr(directions.T)[0].T
+    for j, i in itertools.combinations(range(len(rows)), 2):
+        a, b = matrix(rows[i]), matrix(rows[j])
+        bracket = components(a @ b - b @ a)
+        if (residual := np.linalg.norm(bracket - rows.T @ (rows @ bracket))) > SUBALGEBRA_TOLERANCE:
+            raise ParameterError(
+                f"the stabilizer in {group.name} is not a subalgebra: the bracket of its directions {j} and {i} is "
+                f"{residual:.2g} off their span; add what is missing"
+            )
+    return rows
+
+
+_MAX_NEWTON_STEPS = 30
+"""Largest number of iterations of Newton's method."""
+
+
+def first_factor_coordinates(
+    group: MatrixGroup, horizontal_rows: np.ndarray, stabilizer_rows: np.ndarray, element, max_length: float
+):
+    """Return c, shape (k,), with ``exp(c horizontal_rows) exp(b stabilizer_rows) = element``, by Newton's method.
+
+    Parameters
+    ----------
+    horizontal_rows, stabilizer_rows : array, shape (k, dim)
+        Complements of each other in the algebra; h spans a subalgebra.
+    element : array, shape (n, n)
+        Element of the group.
+    max_length : float
+        Length that c must not reach; the result is NaN if it does, or if Newton's method does not converge.
+    """
+    d = len(horizontal_rows)
+
+    def factors(z):
+        return [group.exp_map(group.algebra, part) for part in (z[:d] @ horizontal_rows, z[d:] @ stabilizer_rows)]
+
+    def residual(z, element):
+        a, b = factors(z)
+        return a @ b - element
+
+    def residual_in_algebra(z, element):
+        """Return the residual as a vector of the algebra, which vanishes where the residual does."""
+        a, b = factors(z)
+        return group.algebra.vee(group.inverse_map(a @ b) @ residual(z, element))
+
+    def to_real_vector(a):
+        return jnp.concatenate([a.real.ravel(), a.imag.ravel()])
+
+    def newton_step(state):
+        z, _, steps = state
+        J, f = jax.jacfwd(lambda z: (to_real_vector(residual(z, element)),) * 2, has_aux=True)(z)
+        direction = solve(J.T @ J, -(J.T @ f)[:, None])[:, 0]
+        lengths = 0.5 ** np.arange(8.0)
+        squared_residuals = jax.vmap(lambda t: (to_real_vector(residual(z + t * direction, element)) ** 2).sum())(
+            lengths
+        )
+        move = jnp.asarray(lengths)[jnp.nanargmin(squared_residuals)] * direction
+        return z + move, jnp.abs(move).max(), steps + 1
+
+    def newton_solve(_, start):
+        is_unfinished = lambda state: (state[1] > 1e-8) & (state[2] < _MAX_NEWTON_STEPS)  # noqa: E731
+        z, change, _ = jax.lax.while_loop(is_unfinished, newton_step, (start, jnp.inf, 0))
+        is_solution = (
+            ((z[:d] ** 2).sum() < max_length**2) & (change <= 1e-8) & (jnp.abs(residual(z, element)).max() <= 1e-10)
+        )
+        return jnp.where(is_solution, z, jnp.nan)
+
+    velocity = group.algebra.vee(element - group.inverse_map(element)) / 2.0
+    z = jax.lax.custom_root(  # its derivatives follow from the implicit function theorem
+        lambda z: residual_in_algebra(z, element),
+        jax.lax.stop_gradient(jnp.concatenate([horizontal_rows @ velocity, stabilizer_rows @ velocity])),
+        newton_solve,
+        lambda linear, b: solve(jax.jacfwd(linear)(jnp.zeros_like(b)), b[:, None])[:, 0],
+    )
+    return z[:d]

@@ -2,7 +2,7 @@
 
 The exponentials are combinations of the Stumpff functions of the squared angle, entire functions with no division at
 zero, so values keep full relative accuracy down to the smallest angle and derivatives of every order exist there. The
-logarithms use :func:`manifolds.matrices.stumpff.angle_over_sine`, which is smooth at zero too.
+logarithms use :func:`manifolds.matrices.exponential.angle_over_sine`, which is smooth at zero too.
 """
 
 from __future__ import annotations
@@ -14,8 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..algebras.lie_algebra import LieAlgebra
+from ..matrices.exponential import (
+    HALF_TURN_MARGIN,
+    _root_or_nan,
+    _squared_length,
+    angle_over_sine,
+    leading_sign,
+    stumpff,
+)
 from ..matrices.linear import adjoint, determinant, inverse, max_abs_entry, newton_schulz_step
-from ..matrices.stumpff import HALF_TURN_MARGIN, _root_or_nan, _squared_length, angle_over_sine, leading_sign, stumpff
 from ..matrices.symmetric import eigh, symmetrize
 from .maps import log
 

@@ -1,16 +1,24 @@
-"""Maps between an algebra of matrices and its group that work for any algebra."""
+"""Maps between an algebra of matrices and its group: for any algebra, for products, and from defining equations."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
 from math import comb
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
+from .._arguments import checked_size
+from ..algebras._subspaces import RANK_TOLERANCE, numerical_null_space
+from ..algebras.blocks import direct_sum
 from ..algebras.lie_algebra import LieAlgebra
+from ..errors import ClosureError, ParameterError
 from ..matrices.exponential import CAYLEY_CONDITION_LIMIT, cayley_of, expm
 from ..matrices.linear import _one_norm, _square_root, determinant, max_abs_entry, solve, solve_near_identity
 
@@ -157,3 +165,222 @@ def log(algebra: LieAlgebra, g) -> jax.Array:
     remainder = algebra.vee(expm(algebra.hat(-x)) @ g - identity)
     x = x + solve(dexp(algebra, x), remainder[..., None])[..., 0]
     return jnp.where(is_converged[..., None], x, jnp.nan)
+
+
+@dataclass(frozen=True)
+class BlockMap:
+    """A map of each factor of a product, applied to the blocks of a matrix or to the parts of an element.
+
+    Attributes
+    ----------
+    maps : tuple of callable
+        The map of each factor.
+    algebras : tuple of LieAlgebra
+        The algebras of the factors.
+    takes_components, gives_components : bool
+        True if the arguments, or the values, are components of the algebra instead of matrices.
+    """
+
+    maps: tuple[Callable, ...]
+    algebras: tuple[LieAlgebra, ...]
+    takes_components: bool = False
+    gives_components: bool = False
+
+    def __call__(self, algebra: LieAlgebra, argument) -> jax.Array:
+        parts = (_split_components if self.takes_components else split_blocks)(self.algebras, argument)
+        images = [f(g, part) for f, g, part in zip(self.maps, self.algebras, parts, strict=True)]
+        return jnp.concatenate(images, axis=-1) if self.gives_components else join_blocks(images)
+
+
+@dataclass(frozen=True)
+class MatrixBlockMap:
+    """A map ``g -> g`` of each factor of a product, applied to the blocks."""
+
+    maps: tuple[Callable, ...]
+    algebras: tuple[LieAlgebra, ...]
+
+    def __call__(self, g) -> jax.Array:
+        blocks = split_blocks(self.algebras, g)
+        return join_blocks([f(block) for f, block in zip(self.maps, blocks, strict=True)])
+
+
+@dataclass(frozen=True)
+class BlockDefect:
+    """The largest distance of a block from its group, and of the other entries from zero."""
+
+    defects: tuple[Callable, ...]
+    algebras: tuple[LieAlgebra, ...]
+
+    def __call__(self, g) -> jax.Array:
+        blocks = split_blocks(self.algebras, g)
+        largest = jnp.abs(g - join_blocks(blocks)).max(axis=(-2, -1))
+        for defect, block in zip(self.defects, blocks, strict=True):
+            largest = jnp.maximum(largest, defect(block))
+        return largest
+
+
+@dataclass(frozen=True)
+class BlockEquations:
+    """The equations of all factors of a product."""
+
+    equations: tuple[Callable, ...]
+    algebras: tuple[LieAlgebra, ...]
+
+    def __call__(self, g) -> jax.Array:
+        blocks = split_blocks(self.algebras, g)
+        return jnp.concatenate([f(block) for f, block in zip(self.equations, blocks, strict=True)], axis=-1)
+
+
+def product_fields(first: Any, second: Any) -> dict[str, Any]:
+    """Return the fields of the product of two matrix groups, by name."""
+    groups = (first, second)
+    algebras = tuple(group.algebra for group in groups)
+
+    def maps_of_components(kind: str) -> BlockMap | None:
+        maps = tuple({"cayley": g.cayley_map, "adjoint_cayley": g.adjoint_cayley_map}[kind] for g in groups)
+        return None if None in maps else BlockMap(maps, algebras, takes_components=True)
+
+    equations = tuple(group.equations for group in groups)
+    return {
+        "name": f"{first.name} x {second.name}",
+        "algebra": direct_sum(*algebras),
+        "defect": BlockDefect(tuple(group.defect for group in groups), algebras),
+        "inverse_map": MatrixBlockMap(tuple(group.inverse_map for group in groups), algebras),
+        "exp_map": BlockMap(tuple(group.exp_map for group in groups), algebras, takes_components=True),
+        "log_map": BlockMap(tuple(group.log_map for group in groups), algebras, gives_components=True),
+        "cayley_map": maps_of_components("cayley"),
+        "inverse_cayley_map": BlockMap(
+            tuple(group.inverse_cayley_map for group in groups), algebras, gives_components=True
+        ),
+        "adjoint_cayley_map": maps_of_components("adjoint_cayley"),
+        "restore_map": MatrixBlockMap(tuple(group.restore_map for group in groups), algebras),
+        "equations": None if None in equations else BlockEquations(equations, algebras),
+    }
+
+
+def split_blocks(algebras: tuple[LieAlgebra, ...], g) -> list[jax.Array]:
+    """Return the diagonal blocks of matrices, real ones for factors of real matrices."""
+    blocks, start = [], 0
+    for algebra in algebras:
+        basis = algebra._require_basis()
+        block = g[..., start : start + basis.shape[-1], start : start + basis.shape[-1]]
+        blocks.append(block if jnp.iscomplexobj(basis) else block.real)
+        start += basis.shape[-1]
+    return blocks
+
+
+def join_blocks(blocks: list[jax.Array]) -> jax.Array:
+    """Return block diagonal matrices, shape (..., m, m)."""
+    size, start, rows = sum(block.shape[-1] for block in blocks), 0, []
+    for block in blocks:
+        n = block.shape[-1]
+        widths = [(0, 0)] * (block.ndim - 1) + [(start, size - start - n)]
+        rows.append(jnp.pad(block, widths))
+        start += n
+    return jnp.concatenate(rows, axis=-2)
+
+
+def _split_components(algebras: tuple[LieAlgebra, ...], x) -> list[jax.Array]:
+    parts, start = [], 0
+    for algebra in algebras:
+        parts.append(x[..., start : start + algebra.dim])
+        start += algebra.dim
+    return parts
+
+
+IDENTITY_TOLERANCE = 1e-12
+"""Largest residual of the equations at the identity: rounding of a few operations."""
+
+EXPONENTIAL_TOLERANCE = 1e-9
+"""Largest residual of the equations at exponentials of the algebra: rounding of an exponential and the equations."""
+
+
+@dataclass(frozen=True)
+class IndependentEquations:
+    """Independent combinations of equations of a matrix, with the distance to their solutions to first order.
+
+    Attributes
+    ----------
+    function : callable
+        The equations, matrix (n, n) to array, or to a list of arrays.
+    combinations : tuple of tuple of float
+        Rows of coefficients.
+    """
+
+    function: Callable
+    combinations: tuple[tuple[float, ...], ...]
+
+    def __call__(self, g) -> jax.Array:
+        return jnp.asarray(self.combinations) @ ravel_pytree(self.function(g))[0]
+
+    def newton_step(self, g) -> jax.Array:
+        """Return the least change of one matrix that solves the linearised equations, shape (n, n)."""
+        derivative = jax.jacfwd(self)(g).reshape(len(self.combinations), -1)
+        weights = solve(derivative @ derivative.T, -self(g)[:, None])[:, 0]
+        return (weights @ derivative).reshape(g.shape)
+
+
+@dataclass(frozen=True)
+class EquationDefect:
+    """Distance of a matrix from the solutions of equations to first order, relative to the size of the matrix."""
+
+    equations: IndependentEquations
+
+    def __call__(self, g) -> jax.Array:
+        return jnp.abs(self.equations.newton_step(g)).max() / jnp.maximum(jnp.abs(g).max(), 1e-300)
+
+
+@dataclass(frozen=True)
+class EquationRestore:
+    """One Newton step to the solutions of equations, for batches of matrices."""
+
+    equations: IndependentEquations
+
+    def __call__(self, g) -> jax.Array:
+        return jnp.vectorize(lambda a: a + self.equations.newton_step(a), signature="(m,n)->(m,n)")(g)
+
+
+def fields_from_equations(function: Callable, n: int, name: str) -> dict[str, Any]:
+    """Return the fields of a matrix group of the solutions of equations near the identity.
+
+    The parameters and errors are those of :meth:`manifolds.MatrixGroup.from_equations`.
+    """
+    n = checked_size(n, 1, "MatrixGroup.from_equations(f, n)")
+    identity = jnp.eye(n)
+    try:
+        residual = np.asarray(ravel_pytree(function(identity))[0], dtype=np.float64)
+        derivative = np.asarray(jax.jacfwd(lambda a: ravel_pytree(function(a))[0])(identity)).reshape(-1, n * n)
+    except TypeError as error:
+        raise ParameterError(
+            f"f must be a function by jax.numpy from a real matrix ({n}, {n}) to real arrays: {error}"
+        ) from None
+    if not np.abs(residual).max(initial=0.0) <= IDENTITY_TOLERANCE:
+        raise ParameterError(
+            f"f must vanish at the identity, got {np.abs(residual).max():.3g}; subtract its value there"
+        )
+    scale = float(np.abs(derivative).max(initial=0.0))
+    if not scale > 0.0:
+        raise ParameterError("the derivative of f at the identity is zero, so it defines no algebra; use a first power")
+    left, singular_values, _ = np.linalg.svd(derivative / scale)
+    vectors = numerical_null_space(derivative / scale, name)
+    if not len(vectors):
+        raise ParameterError("f has the identity as an isolated solution: the group has dimension 0")
+    algebra = LieAlgebra.from_matrices(vectors.reshape(-1, n, n), name=f"algebra of {name}")
+    combinations = left[:, : int((singular_values > RANK_TOLERANCE).sum())].T
+    equations = IndependentEquations(function, tuple(map(tuple, combinations.tolist())))
+    x = np.random.default_rng(0).standard_normal((4, algebra.dim))
+    for matrix in np.asarray(jax.scipy.linalg.expm(algebra.hat(x) / np.linalg.norm(algebra.hat(x)))):
+        residual = np.abs(np.asarray(ravel_pytree(function(jnp.asarray(matrix)))[0])).max()
+        if not residual <= EXPONENTIAL_TOLERANCE * max(1.0, scale):
+            raise ClosureError(
+                f"the solutions of f are no group: exponentials of its algebra miss them by {residual:.3g} (tolerance "
+                f"{EXPONENTIAL_TOLERANCE * max(1.0, scale):.0e}); add the equations that are missing",
+                residual=float(residual),
+                tolerance=EXPONENTIAL_TOLERANCE * max(1.0, scale),
+            )
+    return {
+        "name": name,
+        "algebra": algebra,
+        "defect": EquationDefect(equations),
+        "restore_map": EquationRestore(equations),
+    }

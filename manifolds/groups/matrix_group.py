@@ -19,17 +19,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arrays import first_true_index, format_index, is_traced, real_components, square_matrices
+from .._arrays import first_nonfinite_index, first_true_index, format_index, is_traced, real_components, square_matrices
 from .._class_members import ListedType
 from ..algebras.lie_algebra import LieAlgebra
 from ..errors import ComponentError, DomainError, LieAlgebraError
-from ..matrices.exponential import CAYLEY_CONDITION_LIMIT, cayley_of
+from ..matrices.exponential import CAYLEY_CONDITION_LIMIT, HALF_TURN_MARGIN, cayley_of
 from ..matrices.linear import inverse, max_abs_entry, solve
-from ..matrices.stumpff import HALF_TURN_MARGIN
 from . import closed_forms as closed
 from . import maps
-from .defining_equations import fields_from_equations
-from .products import product_fields
+from .maps import fields_from_equations, product_fields
 
 MEMBERSHIP_TOLERANCE = 1e-8
 """Largest distance of a matrix from the group, relative to its size, at which its logarithm is taken."""
@@ -185,7 +183,7 @@ class MatrixGroup(metaclass=ListedType):
         """
         g = self._element(g, "g")
         inverse = _call_compiled(self.inverse_map, g)
-        if (index := _first_nonfinite_index(inverse, 2)) is not None:
+        if (index := first_nonfinite_index(inverse, 2)) is not None:
             raise DomainError(f"{self.name}: g{format_index(index)} has no inverse: it is singular or not finite")
         return inverse
 
@@ -250,7 +248,7 @@ class MatrixGroup(metaclass=ListedType):
         """
         g = self._element(g, "g")
         x = _log(self, g)
-        if (index := _first_nonfinite_index(x, 1)) is not None:
+        if (index := first_nonfinite_index(x, 1)) is not None:
             raise DomainError(
                 f"log on {self.name}: g{format_index(index)} {self._why_not_in_domain(np.asarray(g[index]))}"
             )
@@ -277,7 +275,7 @@ class MatrixGroup(metaclass=ListedType):
         self._require_map("cayley")
         x = self._components(x, "x")
         g = _cayley(self, x)
-        if (index := _first_nonfinite_index(g, 2)) is not None:
+        if (index := first_nonfinite_index(g, 2)) is not None:
             x = np.asarray(x[index])
             reason = self._why_no_cayley(x, self.algebra.hat(x) if np.isfinite(x).all() else x)
             raise DomainError(f"cayley on {self.name}: x{format_index(index)} {reason}")
@@ -296,7 +294,7 @@ class MatrixGroup(metaclass=ListedType):
         self._require_map("cayley")
         g = self._element(g, "g")
         x = _inverse_cayley(self, g)
-        if (index := _first_nonfinite_index(x, 1)) is not None:
+        if (index := first_nonfinite_index(x, 1)) is not None:
             reason = self._why_not_in_domain(np.asarray(g[index]), "inverse Cayley map needs no eigenvalue -1", "map")
             raise DomainError(f"inverse_cayley on {self.name}: g{format_index(index)} {reason}")
         return x
@@ -327,7 +325,7 @@ class MatrixGroup(metaclass=ListedType):
         assert self.adjoint_cayley_map is not None
         x = self._components(x, "x")
         g = _call_compiled(self.adjoint_cayley_map, self.algebra, x)
-        if (index := _first_nonfinite_index(g, 2)) is not None:
+        if (index := first_nonfinite_index(g, 2)) is not None:
             x = np.asarray(x[index])
             reason = self._why_no_cayley(x, self.algebra.ad(x))
             raise DomainError(f"adjoint_cayley on {self.name}: for ad(x), x{format_index(index)} {reason}")
@@ -580,13 +578,3 @@ def _log_jvp(group: MatrixGroup, primals, tangents):
 
 
 _log = jax.jit(_principal_log, static_argnums=0)
-
-
-def _first_nonfinite_index(result, n_core_axes: int) -> tuple[int, ...] | None:
-    """Return the batch index of the first result that is not finite, or None; None while tracing.
-
-    The last ``n_core_axes`` axes of the result hold one element.
-    """
-    if is_traced(result):
-        return None
-    return first_true_index(~np.isfinite(np.asarray(result)).all(axis=tuple(range(-n_core_axes, 0))))

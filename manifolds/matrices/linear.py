@@ -1,10 +1,15 @@
-"""Linear algebra of small matrices: elimination, orthonormal complements, square roots, determinants."""
+"""Linear algebra of small matrices: elimination, complements, square roots, determinants, and repeated blocks."""
 
 from __future__ import annotations
 
+from typing import Any
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from .._pytree_module import Module
 
 
 def adjoint(a):
@@ -234,3 +239,37 @@ def _eliminate(a, b):
     start = (jnp.concatenate([a, b], axis=-1), jnp.ones(a.shape[:-2], dtype=a.dtype))
     table, det = jax.lax.fori_loop(0, m, step, start)
     return table[..., : b.shape[-1]], det
+
+
+class BlockDiagonal(Module):
+    """Linear map of a block diagonal matrix whose blocks may be repeated.
+
+    Attributes
+    ----------
+    blocks : tuple
+        Square matrices, or other linear maps that ``@`` applies to one vector.
+    sizes, counts : tuple of int
+        Rows of each block, and the number of its consecutive copies.
+    """
+
+    blocks: tuple[Any, ...]
+    sizes: tuple[int, ...] = eqx.field(static=True)
+    counts: tuple[int, ...] = eqx.field(static=True)
+
+    def __matmul__(self, x) -> jax.Array:
+        """Return the image of a vector, shape (n,)."""
+        images, start = [], 0
+        for block, size, count in zip(self.blocks, self.sizes, self.counts, strict=True):
+            block_vectors = x[start : start + size * count].reshape(count, size)
+            images.append(jax.vmap(lambda v, block=block: block @ v)(block_vectors).ravel())
+            start += size * count
+        return images[0] if len(images) == 1 else jnp.concatenate(images)
+
+
+class Diagonal(Module):
+    """Linear map of a diagonal matrix; ``entries`` has shape (n,), or () for a multiple of the identity."""
+
+    entries: jax.Array
+
+    def __matmul__(self, x) -> jax.Array:
+        return self.entries * x

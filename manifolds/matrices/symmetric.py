@@ -10,9 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .exponential import expm
+from .exponential import expm, hyperbolic_stumpff
 from .linear import adjoint, max_abs_entry, newton_schulz_step, solve
-from .stumpff import hyperbolic_stumpff
 
 _MAX_EXCESS_FOR_LOG1P = 0.5
 """Largest entry of w - I for which the logarithm of w uses eigenvalues of w - I, instead of w."""

@@ -1,19 +1,13 @@
 """State spaces: Riemannian manifolds with geodesics in JAX; one base class and its native instances."""
 
 from .base import Space, registered_spaces
-from .correlation import Correlation
-from .euclidean import Euclidean
-from .flag import Flag
-from .grassmann import Grassmann
+from .constant_curvature import Euclidean, Hyperbolic, Sphere
 from .groups import GroupSpace, SpecialEuclidean, SpecialOrthogonal, SpecialUnitary
-from .homogeneous import Homogeneous
-from .hyperbolic import Hyperbolic
+from .homogeneous import Flag, Homogeneous
 from .level_set import LevelSet
-from .product import Oblique, Power, Product
-from .spd import SPD
-from .sphere import Sphere
-from .stiefel import Stiefel
-from .tangent_bundle import TangentBundle
+from .product import Oblique, Power, Product, TangentBundle
+from .spd import SPD, Correlation
+from .stiefel import Grassmann, Stiefel
 
 __all__ = [
     "SPD",

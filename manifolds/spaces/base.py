@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arrays import first_true_index, format_index, is_traced, numeric_array
+from .._arrays import first_nonfinite_index, first_true_index, format_index, is_traced, numeric_array
 from ..errors import ComponentError, DomainError, OffManifoldError, ShapeError
 from ..groups.matrix_group import MEMBERSHIP_TOLERANCE
 from .maps import SpaceMaps
@@ -108,7 +108,7 @@ class Space(SpaceMaps):
         """
         x = self._ambient_array(x, "x")
         y = self._call_compiled("_project", x)
-        if (index := self._first_nan_index(y, len(self.shape))) is not None:
+        if (index := first_nonfinite_index(y, len(self.shape))) is not None:
             raise DomainError(f"{self.name}: no point of the space is nearest to x{format_index(index)}")
         return y
 
@@ -375,18 +375,12 @@ class Space(SpaceMaps):
         return jnp.abs(v - self._project_tangent(x, v)).max(axis=axes, initial=0.0) / scale
 
     def _raise_if_not_finite(self, value, n_core_axes: int, x, y, map_name: str) -> None:
-        if (index := self._first_nan_index(value, n_core_axes)) is not None:
+        if (index := first_nonfinite_index(value, n_core_axes)) is not None:
             batch = value.shape[: value.ndim - n_core_axes]
             x, y = (np.asarray(jnp.broadcast_to(a, (*batch, *self.shape))[index]) for a in (x, y))
             raise DomainError(
                 f"{self.name}: {map_name}(x, y){format_index(index)} is not defined: {self._explain_missing_log(x, y)}"
             )
-
-    @staticmethod
-    def _first_nan_index(value, n_core_axes: int) -> tuple[int, ...] | None:
-        if is_traced(value):
-            return None
-        return first_true_index(~np.isfinite(np.asarray(value)).all(axis=tuple(range(-n_core_axes, 0))))
 
     # -- helpers --------------------------------------------------------------------------------------------------
 

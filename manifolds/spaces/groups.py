@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._arguments import checked_size
 from .._arrays import numeric_array
 from .._pytree_module import forward_to
-from .._sizes import checked_size
 from ..errors import ParameterError, SpaceError
 from ..groups.catalogue import SE, SL, SO, SU, Heisenberg
 from ..groups.closed_forms import affine_matrix, return_unchanged

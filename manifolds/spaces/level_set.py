@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._frozen import FrozenFunction
-from .._sizes import checked_size
+from .._arguments import checked_size
+from .._content_keys import FrozenFunction
 from ..errors import DomainError, ParameterError, SpaceError
 from ..matrices.linear import solve_near_identity
 from .base import MEMBERSHIP_TOLERANCE, Space, register

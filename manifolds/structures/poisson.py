@@ -1,10 +1,15 @@
-"""Poisson structures: a skew tensor Pi(x) with ``{f, g} = grad f . Pi grad g`` and ``x' = Pi grad H`` [BFM 2.1]."""
+"""Poisson structures: a skew tensor Pi(x) with ``{f, g} = grad f . Pi grad g`` and ``x' = Pi grad H`` [BFM 2.1].
+
+Among them are the dual of an algebra, density matrices (the dual of u(N)), and the phase space of several bodies with
+an entropy each [SML §5].
+"""
 
 from __future__ import annotations
 
 import functools
 from abc import abstractmethod
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -304,3 +309,158 @@ class NoPoisson(PoissonStructure):
 
     def jacobi_residual(self, x) -> jax.Array:
         return jnp.zeros(())
+
+
+class DensityMatrices(PoissonBySharp):
+    """Lie-Poisson structure of u(N)* on Hermitian matrices: ``Pi dE = -i [dE, rho]``, in units where hbar is 1.
+
+    A matrix has N^2 real coordinates in a basis that is orthonormal for ``tr(A B)``: its diagonal, then for each pair j
+    < k ``sqrt(2)`` times the real part of ``rho_jk``, and in the order of these pairs ``sqrt(2)`` times the imaginary
+    part. The gradient of ``tr(rho H)`` has the coordinates of H. It is :class:`LiePoisson` of ``u(N)`` where ``i rho``
+    is the matrix of an element of the dual, and ``i H`` that of an element of the algebra.
+
+    Attributes
+    ----------
+    size : int
+        N.
+    """
+
+    size: int = eqx.field(static=True)
+
+    @property
+    def dim(self) -> int:
+        return self.size**2
+
+    def matrix(self, x) -> jax.Array:
+        """Return the Hermitian matrices with coordinates x, shape (..., N^2) to (..., N, N)."""
+        (re, im), (factor, sign), _ = _coordinate_indices(self.size)
+        real, imaginary = (
+            entries.reshape(*entries.shape[:-1], self.size, self.size) for entries in (x[..., re], x[..., im])
+        )
+        real, imaginary = real * factor, imaginary * sign
+        return real + 1j * imaginary if isinstance(x, np.ndarray) else jax.lax.complex(real, imaginary)
+
+    def vector(self, a) -> jax.Array:
+        """Return the coordinates of the Hermitian parts of matrices a, shape (..., N, N): the inverse of
+        :meth:`matrix`."""
+        xp = np if isinstance(a, np.ndarray) else jnp
+        transpose, (_, (factor, _), indices) = a.swapaxes(-1, -2), _coordinate_indices(self.size)
+        entries = xp.stack(
+            [(a.real + transpose.real) * (0.5 / factor), (a.imag - transpose.imag) * (0.5 / factor)], axis=-3
+        )
+        return entries.reshape(*a.shape[:-2], -1)[..., indices]
+
+    def sharp(self, x, alpha) -> jax.Array:
+        product = self.matrix(alpha) @ self.matrix(x)
+        return self.vector(-2j * product)  # whose Hermitian part has both terms of the commutator
+
+    def stages_on_leaf(self, x, alpha, A) -> jax.Array:
+        """Return ``U_i rho U_i^H``, with stages U_i by A of ``U' = -i H U`` from the identity; eigenvalues are
+        conserved."""
+        return self.vector(conjugate_by_stages(-1j * self.matrix(alpha), self.matrix(x), A))
+
+    def leaf_covector_rate(self, covector, alpha) -> jax.Array:
+        return self.vector(1j * cayley_rate(-1j * self.matrix(covector), -1j * self.matrix(alpha)))
+
+
+@functools.lru_cache(maxsize=64)
+def _coordinate_indices(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return index arrays between coordinates and matrix entries, with the factors.
+
+    The first array has the coordinate of the real and the imaginary part of each entry, the second the factors of these
+    parts, the third the position of each coordinate among the parts.
+    """
+    (j, k), diagonal, half_root = np.triu_indices(n, 1), np.arange(n), np.sqrt(0.5)
+    pairs = n + np.arange(len(j))
+    re, im = np.empty((2, n, n), np.uint32)  # without a sign: JAX then looks for no negative ones
+    factors = np.full((2, n, n), half_root)
+    re[diagonal, diagonal] = im[diagonal, diagonal] = diagonal
+    factors[0, diagonal, diagonal], factors[1, diagonal, diagonal] = 1.0, 0.0
+    re[j, k] = re[k, j] = pairs
+    im[j, k] = im[k, j] = pairs + len(j)
+    factors[1, k, j] = -half_root
+    entry_indices = np.concatenate([diagonal * (n + 1), j * n + k, n * n + j * n + k])
+    return np.stack([re.ravel(), im.ravel()]), factors, entry_indices.astype(np.uint32)
+
+
+class StateIndices(NamedTuple):
+    """Indices of all q, p and S in a state of several (q_a, p_a, S_a), and the body a that owns each q."""
+
+    q: np.ndarray
+    p: np.ndarray
+    S: np.ndarray
+    owner: np.ndarray
+
+
+class ParticleIndices(NamedTuple):
+    """Indices of the particle numbers in a state, and the body that owns each."""
+
+    N: np.ndarray
+    owner: np.ndarray
+
+
+class ExtendedPhaseSpace(PoissonStructure):
+    """Poisson structure on ``T*R^n_1 x R x … x T*R^n_N x R``, coordinates (q_1, p_1, S_1, q_2, …): canonical [SML §5].
+
+    Every S_a is a Casimir function. With n_a = 0 a body has S_a alone. ``species`` gives the number of particle numbers
+    that follow the S_a of each body; they are Casimir functions too.
+    """
+
+    degrees_of_freedom: tuple[int, ...] = eqx.field(static=True)
+    species: tuple[int, ...] = eqx.field(static=True, default=())
+
+    def __check_init__(self):
+        for numbers, label in ((self.degrees_of_freedom, "degrees of freedom"), (self.species or (0,), "species")):
+            if not (isinstance(numbers, tuple) and numbers and all(isinstance(n, int) and n >= 0 for n in numbers)):
+                raise ParameterError(f"{label} must be a tuple of integers >= 0, got {numbers!r}")
+        if self.species and len(self.species) != len(self.degrees_of_freedom):
+            raise ParameterError(f"species are given for {len(self.species)} of {len(self.degrees_of_freedom)} bodies")
+
+    @property
+    def dim(self) -> int:
+        return 2 * sum(self.degrees_of_freedom) + len(self.degrees_of_freedom) + sum(self.species)
+
+    @property
+    def state_indices(self) -> StateIndices:
+        """Indices of all q, p and S in a state."""
+        return _build_indices(self.degrees_of_freedom, self.species)[0]
+
+    @property
+    def particle_indices(self) -> ParticleIndices:
+        """Indices of the particle numbers in a state."""
+        return _build_indices(self.degrees_of_freedom, self.species)[1]
+
+    def tensor(self, x) -> jax.Array:
+        del x  # constant
+        return jnp.asarray(np.eye(self.dim)[self._conjugate] * self._sign[:, None])
+
+    def sharp(self, x, alpha) -> jax.Array:
+        del x
+        return self._sign * alpha[self._conjugate]
+
+    @property
+    def _conjugate(self) -> np.ndarray:
+        q, p, _, _ = self.state_indices
+        partner = np.arange(self.dim)
+        partner[q], partner[p] = p, q
+        return partner
+
+    @property
+    def _sign(self) -> np.ndarray:
+        q, p, _, _ = self.state_indices
+        sign = np.zeros(self.dim)
+        sign[q], sign[p] = 1.0, -1.0
+        return sign
+
+
+@functools.lru_cache(maxsize=64)
+def _build_indices(
+    degrees_of_freedom: tuple[int, ...], species: tuple[int, ...]
+) -> tuple[StateIndices, ParticleIndices]:
+    n, m = np.array(degrees_of_freedom), np.array(species or (0,) * len(degrees_of_freedom))
+    starts = np.cumsum(2 * n + 1 + m) - (2 * n + 1 + m)
+    owner, holder = np.repeat(np.arange(len(n)), n), np.repeat(np.arange(len(n)), m)
+    q = starts[owner] + np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
+    S = starts + 2 * n
+    N = S[holder] + 1 + np.arange(m.sum()) - np.repeat(np.cumsum(m) - m, m)
+    return StateIndices(q, q + n[owner], S, owner), ParticleIndices(N, holder)

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._arguments import checked_size
 from .._arrays import real_array, stack_columns
-from .._sizes import checked_size
 from ..errors import ParameterError
 from .poisson import PoissonBySharp
 
@@ -37,8 +37,7 @@ class Spins(PoissonBySharp):
         gamma_i: with ``s' = s x grad H``, the physics of a moment ``-gamma s`` in the field ``-grad H``.
     margins : tuple of int, optional
         If given, states have the spins component by component, ``(s_1x, s_2x, …, s_1y, …)``, which makes memory access
-        of large states faster, and computations use a halo of this many sites along each axis, see
-        :class:`PaddedLattice`.
+        of large states faster. Energies then use a halo of this many sites along each axis, see :class:`PaddedLattice`.
 
     Raises
     ------
@@ -78,11 +77,7 @@ class Spins(PoissonBySharp):
 
     def spins(self, x) -> VectorComponents:
         """Return the components of the spins of a state, shape (n,): three arrays, shape (count,)."""
-        if self.margins is None:
-            return self.split_covectors(x)
-        return reshape_vectors(
-            PaddedLattice(reshape_vectors(self.split_covectors(x), self.sites), self.margins).site_spins, (self.count,)
-        )
+        return spins_from_state(x, self.count, self.is_component_major)
 
     def split_covectors(self, alpha) -> VectorComponents:
         """Return the components of covectors of the spins: three arrays, shape (count,)."""
@@ -144,7 +139,8 @@ def spins_from_state(x, count: int, is_component_major: bool = False) -> VectorC
 
 def state_from_spins(spins: VectorComponents, others, is_component_major: bool = False) -> jax.Array:
     """Return the state, shape (n,), of spins by components, with the other components behind."""
-    columns = spins if is_component_major else (stack_columns(spins).reshape(-1),)
+    # without the barrier, the program that joins the columns would compute what they share once for each
+    columns = jax.lax.optimization_barrier(spins) if is_component_major else (stack_columns(spins).reshape(-1),)
     return jnp.concatenate([*columns, others]) if is_component_major or others.size else columns[0]
 
 

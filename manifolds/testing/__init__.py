@@ -4,11 +4,8 @@ Each ``check_*`` runs the checks of every registered object of that kind. It ret
 :class:`PropertyError` with the table of the residuals.
 """
 
-from .._names import public_dir
-from .algebras import check_algebra
-from .groups import check_group
-from .report import PropertyError, Report, Suite
-from .spaces import check_space
+from .._arguments import public_dir
+from .suites import PropertyError, Report, Suite, check_algebra, check_group, check_space
 
 __all__ = ["PropertyError", "Report", "Suite", "check_algebra", "check_group", "check_space"]
 __dir__ = public_dir(__all__)

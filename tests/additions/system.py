@@ -5,10 +5,11 @@ import numpy as np
 
 import liethermo as lt
 import manifolds as mf
+from liethermo.systems import Domain
 
 
 class LotkaVolterra(lt.System):
-    domain = "positive numbers"
+    domain = Domain("positive numbers", lambda x: "" if np.all(np.asarray(x) > 0.0) else "a species has no members")
 
     def __init__(self, interaction, rest):
         A, rest = np.asarray(interaction, dtype=float), np.asarray(rest, dtype=float)
@@ -17,6 +18,3 @@ class LotkaVolterra(lt.System):
 
     def samples(self, count, seed=0, scale=1.0):
         return np.random.default_rng(seed).uniform(0.5, 2.0, (count, self.dim))
-
-    def outside(self, x):
-        return "" if np.all(np.asarray(x) > 0.0) else "a species has no members"

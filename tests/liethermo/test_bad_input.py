@@ -8,7 +8,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.models.open_gases import porous_piston_state
+from liethermo.models.gases import porous_piston_state
 
 V = lt.VariationalIntegrator
 D = lt.DiscreteHerglotz

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import liethermo as lt
-from liethermo.models.mass_spring_gas import CASES, STARTS, mass_spring_gas_solution
+from liethermo.models.gases import CASES, STARTS, mass_spring_gas_solution
 from liethermo.tracing.interpret import evaluate_at_points
 
 from . import Difference, Order, Tests, Value, fields, order, relative_difference, row, solve_with_scipy

@@ -9,7 +9,7 @@ import numpy as np
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.models.oscillator import damped_oscillator_solution
+from liethermo.models.springs import damped_oscillator_solution
 from liethermo.models.thermo_particles import thermo_particles_solution
 from liethermo.tracing.interpret import evaluate_at_points
 

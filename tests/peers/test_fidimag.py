@@ -186,9 +186,9 @@ def test_energy():
     assert (np.diff(run.energy) < 0.0).all()
 
 
-def relax(energy, start, time, step, rate=0.5):
+def relax(energy, start, time, step):
     """Return the spins after damping with almost no precession, in the shape of the start."""
-    system = lt.SpinSystem(len(start), energy, lt.LandauLifshitz(rate), ratio=1e-3)
+    system = lt.SpinSystem(len(start), energy, lt.LandauLifshitz(0.5), ratio=1e-3)
     run = lt.integrate(system, np.ravel(start), (0.0, time), step, lt.MetriplecticRungeKutta(4), save_every=1000)
     return run.x[-1].reshape(-1, 3)
 

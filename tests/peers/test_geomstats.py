@@ -14,16 +14,13 @@ import pytest
 import manifolds as mf
 from manifolds.matrices.exponential import expm
 from manifolds.matrices.spectral import spectral
+from tests.cases import max_abs
 
 EXACT = 1e-14
 """Results of order one; at most 2e-15 seen."""
 
 LN_2 = np.log(2.0)
 SINH_1 = np.sinh(1.0)
-
-
-def max_abs(a) -> float:
-    return float(np.abs(np.asarray(a)).max(initial=0.0))
 
 
 def unit_vector(x):

@@ -14,15 +14,12 @@ import numpy as np
 import pytest
 
 import manifolds as mf
+from tests.cases import max_abs
 
 EXACT = 2e-14
 """Results of order one; at most 3e-15 seen."""
 
 GROUPS = {"SO(2)": (mf.SO, 2), "SE(2)": (mf.SE, 2), "SO(3)": (mf.SO, 3), "SE(3)": (mf.SE, 3)}
-
-
-def max_abs(a) -> float:
-    return float(np.abs(np.asarray(a)).max(initial=0.0))
 
 
 @pytest.fixture(scope="module", params=GROUPS)

@@ -13,13 +13,10 @@ import pytest
 
 import manifolds as mf
 from manifolds.matrices.exponential import expm
+from tests.cases import max_abs
 
 EXACT = 1e-14
 """Results of order one; at most 2e-15 seen."""
-
-
-def max_abs(a) -> float:
-    return float(np.abs(np.asarray(a)).max(initial=0.0))
 
 
 # -- sphere ------------------------------------------------------------------------------------------------------------

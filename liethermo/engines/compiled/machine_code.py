@@ -1,19 +1,26 @@
-"""Compilation of LLVM modules to machine code, cached on disk and unloaded when unused."""
+"""Compilation of LLVM modules to machine code, cached on disk and unloaded when unused; functions at many points."""
 
 from __future__ import annotations
 
+import ctypes
 import ctypes.util
 import functools
 import hashlib
 import os
 import struct
 import threading
+from collections.abc import Callable
 
+import jax
 import llvmlite.binding as llvm
+import numpy as np
 from llvmlite import ir
 
-from ...tracing import code_cache
+from ...tracing.program import Program
+from ...tracing.programs import host_processor, read_machine_code, write_machine_code
+from ...tracing.scalarize import UnsupportedPrimitive, report_compiler_faults, scalarize
 from . import lapack
+from .llvm_writer import FLOAT64, INT64, ProgramWriter
 
 
 class MachineCode:
@@ -41,12 +48,12 @@ class MachineCode:
                 name = hashlib.sha256(
                     f"{_host_target_cpu_features_and_text()[-1]} {self.skip_optimisation}\n{text}".encode()
                 ).hexdigest()[:32]
-                object_file = _parse_object_file(code_cache.read_machine_code(name))
+                object_file = _parse_object_file(read_machine_code(name))
                 if object_file is not None:
                     break
             else:
                 code = _compile_module(text, skip_optimisation)
-                code_cache.write_machine_code(name, code)
+                write_machine_code(name, code)
                 object_file = _parse_object_file(code)
             self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _new_target_machine())
             self._engine.add_object_file(object_file)
@@ -72,7 +79,7 @@ def _host_target_cpu_features_and_text() -> tuple[llvm.Target, str, str, str]:
     math_library = ctypes.util.find_library("m")
     if math_library:
         llvm.load_library_permanently(math_library)
-    triple, cpu, features = code_cache.host_processor()
+    triple, cpu, features = host_processor()
     if cpu_variable := os.environ.get("LIETHERMO_CPU", ""):
         cpu, features = cpu_variable, ""
     version = ".".join(map(str, llvm.llvm_version_info))
@@ -130,3 +137,77 @@ def _compile_module(text: str, skip_optimisation: bool) -> bytes:
     builder = llvm.create_pass_builder(target, options)
     builder.getModulePassManager().run(module, builder)
     return target.emit_object(module)
+
+
+MAX_EVALUATOR_INSTRUCTIONS = 10_000
+"""Largest number of instructions of a function that is compiled for a few points; LLVM takes about a second for it."""
+
+EVALUATE_SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_int64)
+"""C signature of ``evaluate(parameters, points, results, count)``."""
+
+
+class PointEvaluator:
+    """Compiled function of parameters and a point, evaluated at several points by one call.
+
+    The results are written to the same array by every call, so each thread needs an evaluator of its own.
+
+    Parameters
+    ----------
+    function : function of arrays of shapes (p,) and (n,) to an array of shape (k,)
+        It must be one that JAX can trace.
+    parameters : array, shape (p,)
+        Those of the next call: a caller sets their values in place.
+    points : array, shape (m, n)
+
+    Raises
+    ------
+    UnsupportedPrimitive
+        If the function cannot be unrolled, or is too large.
+    """
+
+    def __init__(self, function: Callable, parameters: np.ndarray, points: np.ndarray):
+        points = np.array(points, dtype=np.float64)
+        program = scalarize(
+            jax.make_jaxpr(function)(parameters, points[0]), max_instructions=MAX_EVALUATOR_INSTRUCTIONS
+        )
+        if program.instruction_count > MAX_EVALUATOR_INSTRUCTIONS:
+            raise UnsupportedPrimitive("a function", "", "within the size limit", too_large=True)
+        with report_compiler_faults():
+            self._code = _compile_evaluator(program)
+        self._evaluate = EVALUATE_SIGNATURE(self._code.function_address("evaluate"))
+        self._results = np.empty((len(points), len(program.outputs[0])))
+        self._arrays = parameters, points, self._results
+        self._arguments = *(array.ctypes.data for array in self._arrays), len(points)
+
+    def __call__(self) -> np.ndarray:
+        """Return the values at all points, shape (m, k); the next call overwrites them."""
+        self._evaluate(*self._arguments)
+        return self._results
+
+
+class _SeparateRoundingWriter(ProgramWriter):
+    """A writer that rounds products before it adds them, as NumPy does, so that equal products cancel."""
+
+    def fused_multiply_add(self, op, product_index, factors, terms) -> ir.Value:
+        product = self.write_operation("mul", factors)
+        return self.write_operation(op, [product if i == product_index else term for i, term in enumerate(terms)])
+
+
+def _compile_evaluator(program: Program) -> MachineCode:
+    """Compile ``evaluate(parameters, points, results, count)``, which runs a program at each of ``count`` points."""
+    module = ir.Module("points")
+    pointer = FLOAT64.as_pointer()
+    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [pointer, pointer, pointer, INT64]), "evaluate")
+    parameters, points, results, count = function.args
+    writer = _SeparateRoundingWriter(ir.IRBuilder(function.append_basic_block("entry")), 1)
+    build, (_, point_names), (values,) = writer.builder, program.inputs, program.outputs
+    with writer.loop_range(count) as i:
+        starts = parameters, build.gep(points, [build.mul(i, writer.int64(len(point_names)))])
+        result = build.gep(results, [build.mul(i, writer.int64(len(values)))])
+        (row,) = writer.write_as_doubles(
+            program, lambda array, entry: build.load(build.gep(starts[array], [writer.int64(entry)]))
+        )
+        for j, value in enumerate(row):
+            build.store(value, build.gep(result, [writer.int64(j)]))
+    build.ret_void()
+    return MachineCode(module)

@@ -1,8 +1,6 @@
-"""Compiled engine: a user's plain functions as machine code, for small systems on the CPU.
+"""Compiled loop of steps: a step of the array engine unrolled to scalar programs, in a loop that LLVM compiles.
 
-The steps of the array engine, for one system and method, are traced, unrolled to scalar programs (:mod:`liethermo.
-tracing.scalarize`) and placed in a loop over steps (:mod:`.loop`) that LLVM compiles. The system's parameters (the
-arrays among its leaves) stay arguments: a sweep compiles once. Machine code is cached on disk for other processes.
+The system's parameters (the arrays among its leaves) stay arguments, so that a sweep compiles once.
 """
 
 from __future__ import annotations
@@ -20,37 +18,28 @@ import numpy as np
 
 from ...integrators import OneStepMethod
 from ...integrators.fluctuating import noise_dimension, with_noise_increments
-from ...systems import System
 from ...systems.clock import system_of_step
 from ...tracing.caching import LRUCache
 from ...tracing.calls import deferred_p
 from ...tracing.scalarize import report_compiler_faults, scalarize
-from ..array_engine import max_saves_per_call
+from ..adaptive_steps import ATTEMPT_FIELDS, attempt_step, initial_adaptive_state
 from ..root_bracket import search_array_shape
 from ..solver_options import DEFAULT_OPTIONS, SolverOptions
 from ..stage_solver import StageSolution, solve_newton
 from ..status_codes import StatusCode
-from ..step import SavedStates, State, initial_run_state, stage_equations, take_step
-from ..step_control import (
-    ATTEMPT_FIELDS,
-    AdaptiveState,
-    StepControl,
-    attempt_step,
-    initial_adaptive_state,
-    jacobian_probe_shape,
-)
+from ..step import State, initial_run_state, stage_equations, take_step
+from ..step_control import AdaptiveState, StepControl, jacobian_probe_shape
 from .loop_codegen import (
     MAX_UNOPTIMISED_OPERATIONS,
     NEWTON_BUFFER,
     BlockLayout,
     CompiledLoops,
     NamedProgram,
+    compile_newton_solver,
     compile_step_loop,
 )
 from .machine_code import MachineCode
-from .newton_codegen import compile_newton_solver
-from .parameters import ProgramStructure, flat_parameters
-from .short_run import ShortRun
+from .parameters import ProgramStructure
 
 STATE_FIELDS = State._fields
 """Fields of a state."""
@@ -75,185 +64,6 @@ NEWTON_INPUTS = NewtonInputs._fields
 
 NEWTON_OUTPUTS = ("converged", "is_finite", "residual", "newton_iterations", "slope_rounding", "k")
 """Fields of :class:`..stage_solver.StageSolution` that the Newton fallback replaces."""
-
-
-class CompiledEngine:
-    """Compiled engine for one system and method; its steps are those of the array engine.
-
-    Raises
-    ------
-    UnsupportedPrimitive
-        If the system or the method uses a primitive that cannot be unrolled; if only Newton's method does, at the first
-        step that needs it.
-    """
-
-    name = "compiled"
-
-    def __init__(
-        self, system: System, method: OneStepMethod, options: SolverOptions = DEFAULT_OPTIONS, planned_steps: int = 0
-    ):
-        self._parameters, self._planned_steps = flat_parameters(system, method), planned_steps
-        self.max_saves_per_call = max_saves_per_call(system)
-        self._structure, self._method, self._options = ProgramStructure.from_module(system), method, options
-
-    @functools.cached_property
-    def _step_loop(self) -> CompiledStepLoop:
-        """Loop of fixed steps, compiled at its first use: an adaptive run has a loop of its own."""
-        return cached_step_loop(self._structure, self._parameters, self._method, options=self._options)
-
-    def adaptive_step_loop(self, control: StepControl) -> tuple[CompiledStepLoop, np.ndarray]:
-        """Return the step loop of an adaptive run, and its parameters."""
-        parameters = np.append(self._parameters, flat_parameters(control))
-        return cached_step_loop(self._structure, parameters, self._method, control, options=self._options), parameters
-
-    @property
-    def n_operations(self) -> int:
-        """Number of scalar operations of a step."""
-        return self._step_loop.n_operations
-
-    @functools.cached_property
-    def trajectory(self) -> CompiledTrajectory:
-        """The trajectory of the runs of this engine, in buffers that every run uses again."""
-        return self.new_trajectory()
-
-    def new_trajectory(self) -> CompiledTrajectory:
-        """Return a trajectory in buffers of its own."""
-        return CompiledTrajectory(self._step_loop, self._parameters)
-
-    def start(self, x) -> CompiledTrajectory:
-        """Return a trajectory that starts at x; it is written over the one that was started before."""
-        self.trajectory.start(x, self._planned_steps)
-        return self.trajectory
-
-    def initial_run_state(self, x) -> State:
-        return self._state_from_block(
-            self._step_loop.start_blocks(self._parameters, np.asarray(x, dtype=np.float64)[None], self._planned_steps)
-        )
-
-    def advance(self, state: State, h, saves: int, save_every: int, noise=None):
-        new_state, out = self._run(state, h, saves, save_every, noise)
-        is_reached = np.arange(saves) < (int(new_state.step) - int(state.step)) // save_every
-        return new_state, (out[:, :-2], out[:, -2], out[:, -1], is_reached)
-
-    def step(self, state: State, h, noise=None) -> State:
-        return self._run(state, h, 1, 1, noise)[0]
-
-    def step_ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
-        blocks = self._step_loop.start_blocks(self._parameters, x)
-        self._step_loop.advance_blocks(self._parameters, blocks, h, 1, 1)
-        fields = self._step_loop.read_fields(blocks, ("x", "status"))
-        return np.where(fields["status"].reshape(-1, 1) == 0.0, fields["x"], np.nan)
-
-    def _run(self, state: State, h, saves: int, save_every: int, noise) -> tuple[State, np.ndarray]:
-        blocks = self._step_loop.block_from_state(state)
-        out = self._step_loop.advance_blocks(
-            self._parameters, blocks, h, saves, save_every, None if noise is None else noise[None]
-        )[0]
-        return self._state_from_block(blocks), out
-
-    def _state_from_block(self, blocks: np.ndarray) -> State:
-        return self._step_loop.state_from_block(blocks)
-
-
-class CompiledTrajectory:
-    """One trajectory in a compiled loop of steps, in buffers that are allocated once.
-
-    The buffers are written in place by the machine code, so each thread needs a trajectory of its own.
-
-    Parameters
-    ----------
-    step_loop : CompiledStepLoop
-        A loop of one lane, with steps of given sizes.
-    parameters : array, shape (p,)
-        Parameters of the system and the method, one after another.
-
-    Attributes
-    ----------
-    parameters : array, shape (p,)
-        A copy, which may change in place before a start; which parameters are zero may not.
-    """
-
-    def __init__(self, step_loop: CompiledStepLoop, parameters: np.ndarray):
-        self._loop, self.parameters = step_loop, np.array(parameters, dtype=np.float64)
-        self._block = step_loop.make_blocks({"x": np.zeros((1, *step_loop.field_shape("x")))})
-        self._row = rows = step_loop.block_rows(self._block)[0, :, 0]
-        self._x, self._status, self._step, self._h = (
-            rows[step_loop.row_slice(name)] for name in ("x", "status", "step", "h")
-        )
-        self._n_saved_values, self._n_done = step_loop.n_saved_values, np.zeros(1, dtype=np.int64)
-        self._addresses = [array.ctypes.data for array in (self.parameters, self._block, self._n_done)]
-
-    def start(self, x, planned_steps: int = 0) -> None:
-        """Start a trajectory at x, shape (n,); ``planned_steps`` decides on optimisation."""
-        begin, _ = self._loop.loop_functions(0, planned_steps)
-        self._status[0], self._x[:] = 0.0, x
-        begin(self._addresses[0], self._addresses[1], 1)
-
-    def advance(self, h: float, n_saves: int, steps_per_save: int, noise: np.ndarray | None = None) -> SavedStates:
-        """Take ``n_saves * steps_per_save`` steps of size h, fewer if one fails, and return the saved states.
-
-        Raises
-        ------
-        UnsupportedPrimitive
-            If a step needs Newton's method, which cannot be compiled; the trajectory is then as it was before.
-        """
-        first_step, block = self._step[0], self._block.copy()
-        out = np.empty((n_saves, self._n_saved_values))
-        try:
-            self._take_steps(h, n_saves, steps_per_save, noise, out)
-        except BaseException:  # an interrupt too: what is not saved was not taken
-            self._block[:] = block
-            raise
-        n_reached = int(self._step[0] - first_step) // steps_per_save
-        return SavedStates(out[:n_reached, :-2], out[:n_reached, -2:])
-
-    def final_state_function(self, segments: Sequence[tuple[float, int]]) -> Callable[[np.ndarray], np.ndarray | None]:
-        """Return the function from an initial state to the final state, shape (n,), with little work besides the steps.
-
-        Its result is None if a step fails, or needs Newton's method for the first time. A call overwrites this
-        trajectory.
-
-        Parameters
-        ----------
-        segments : sequence of (h, n_steps)
-            Step sizes, and how many steps of each size follow one another.
-        """
-        saved, segments = np.empty(self._n_saved_values), tuple(segments)
-        n_total, loop = sum(n_steps for _, n_steps in segments), self._loop
-        increments = [loop.noise_by_lane_block(None, 1, n_steps) for _, n_steps in segments]
-        addresses = dict(zip(("parameters", "block", "n_done"), self._addresses, strict=True))
-        fields = {"status": self._status, "h": self._h, "saved": saved}
-        addresses |= {name: field.ctypes.data for name, field in fields.items()}
-        take_steps, x_row = ShortRun(addresses, segments, increments), self._x
-
-        def final_state(x: np.ndarray) -> np.ndarray | None:
-            x_row[:] = x
-            return x_row.copy() if take_steps(loop.loop_functions(n_total), loop.newton_address(False)) else None
-
-        final_state.buffer = saved  # type: ignore[attr-defined]  # whose address the run has
-        return final_state
-
-    def read(self, name: str) -> float:
-        """Return a scalar field of the state reached so far."""
-        return float(self._row[self._loop.row_slice(name).start])
-
-    @property
-    def state(self) -> State:
-        """The state reached so far, as a copy."""
-        return self._loop.state_from_block(self._block.copy())
-
-    def _take_steps(self, h: float, n_saves: int, steps_per_save: int, noise: np.ndarray | None, out) -> None:
-        n_steps = n_saves * steps_per_save
-        increments = self._loop.noise_by_lane_block(None if noise is None else noise[None], 1, n_steps)
-        parameters, block, n_done = self._addresses
-        self._h[0], self._n_done[0] = h, 0
-        _, advance = self._loop.loop_functions(n_steps)
-        newton, out_address, noise_address = self._loop.newton_address(False), out.ctypes.data, increments.ctypes.data
-        while (
-            advance(parameters, block, n_done, 1, n_saves, steps_per_save, out_address, n_steps, noise_address, newton)
-            < 1
-        ):
-            newton = self._loop.newton_address(True)
 
 
 EMPTY_INCREMENTS = np.zeros(0)

@@ -1,12 +1,11 @@
 """Energies of spins, lattices, and the quantities that are measured in magnets."""
 
-from manifolds._names import public_dir
+from manifolds._arguments import public_dir
 
 from .bond_terms import biquadratic, exchange_tensor
 from .correlations import StructureFactor, dynamic_structure_factor, structure_factor, topological_charge
 from .dipoles import dipoles
 from .grid_terms import dzyaloshinskii_moriya, exchange
-from .laser import LaserPulse
 from .lattices import Bonds, Lattice, lattice
 from .micromagnetics import (
     continuum_antisymmetric_exchange,
@@ -25,7 +24,7 @@ from .site_terms import (
     uniaxial_anisotropy,
     zeeman,
 )
-from .spin_torques import Slonczewski, SpinOrbit, ZhangLi
+from .spin_torques import LaserPulse, Slonczewski, SpinOrbit, ZhangLi
 from .spin_waves import spin_temperature, spin_wave_frequencies
 from .transitions import Estimate, MagnetSamples, binder_cumulant, cumulant_crossing
 from .units import SpinDynamics, Units, units

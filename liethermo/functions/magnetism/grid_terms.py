@@ -33,10 +33,10 @@ from manifolds.structures.spins import (
 )
 
 from ...errors import InputError
-from ..each import Each
 from ..edges import graph_edges
 from ..energy import Energy, Sum
 from ..indices import clique_pattern
+from ..mechanics import Each
 from .bond_terms import crystal_antisymmetric_exchange, crystal_exchange, refuse_grid_arguments
 from .lattices import Bonds, Lattice
 from .spin_energy import SpinEnergy, bond_indices, checked_site_values, lattice_shape

@@ -24,6 +24,9 @@ from ...functions.newton import newton_iterate
 from ...functions.surface import ConstraintSurface
 from ...systems import SimpleClosedSystem
 
+NEWTON_STEPS = 12
+"""Number of Newton steps to an end entropy or to the next pair of points; they converge quadratically."""
+
 
 class FiniteDifference(Module):
     """Finite difference map of the alpha family, given by its q-, v- and S-representatives [GBY 3.5, §5.1].
@@ -283,14 +286,14 @@ class DiscreteSystem(Module):
         matrix = self.momentum_and_constraint_jacobian(q0, q1, S0, S1)
         return matrix[:-1, :-1] - jnp.outer(matrix[:-1, -1], matrix[-1, :-1]) / matrix[-1, -1]
 
-    def end_entropy_on_constraint(self, q0, q1, S0, steps: int = 12) -> jax.Array:
-        """Return S_1 with ``P_d(q_0, q_1, S_0, S_1) = 0`` after ``steps`` Newton steps; differentiable."""
+    def end_entropy_on_constraint(self, q0, q1, S0) -> jax.Array:
+        """Return S_1 with ``P_d(q_0, q_1, S_0, S_1) = 0``, by Newton steps of a fixed number; differentiable."""
         V = (q1 - q0) / self.h
         return S0 + self.h * newton_iterate(
-            lambda s: self.constraint_residual(Pair(q0, V, S0, s)), jnp.zeros(()), steps
+            lambda s: self.constraint_residual(Pair(q0, V, S0, s)), jnp.zeros(()), NEWTON_STEPS
         )
 
-    def flow(self, q0, q1, S0, S1, steps: int = 12) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    def flow(self, q0, q1, S0, S1, steps: int = NEWTON_STEPS) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """Return the discrete flow on ``C_K^d``, (q_1, q_2, S_1, S_2), after ``steps`` Newton steps [GBY 3.14]."""
         p1, start = self.momenta(q0, q1, S0, S1)[1], jnp.append((q1 - q0) / self.h, (S1 - S0) / self.h)
 

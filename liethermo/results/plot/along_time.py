@@ -1,19 +1,26 @@
-"""Figure of the laws of a run over time."""
+"""Figures of runs: the laws over time, projections of orbits, and the change of invariants."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d import Axes3D
 
+from ...errors import InputError
 from ...functions.gradients import EPS
+from ...systems import System
+from ...systems.invariants import recorded_invariants
 from ..audit import LAW_FAILURE_VERDICT, Audit
 from ..solution import Solution
-from .figures import BLUE, DPI, GREEN, GREY, RED, checked_figure_path, save_figure
+from .figures import BLUE, DPI, GREEN, GREY, ORANGE, RED, checked_figure_path, save_figure
 
 
 def laws(solution: Solution, path: str | os.PathLike | None = None) -> Figure:
@@ -128,3 +135,150 @@ def _verdict_title(audit: Audit) -> str:
         )
     law_rows = [row for row in audit.rows if row.law.startswith(("energy", "entropy", "least", "largest"))]
     return "The laws hold: " + ", ".join(f"{row.law} {row.value:.2g}" for row in law_rows)
+
+
+Coordinate = int | str | Callable
+"""A component by its index, counted from 0, or by its name; or a function of the state."""
+
+COLOURS = (BLUE, ORANGE, GREEN, RED, "black")
+"""Colours of the curves of invariants, used in turn."""
+
+ORBIT_FLOWS = 4
+"""Number of random coadjoint flows in a row that lead from the initial state to a point of its orbit."""
+
+MAX_LABEL_LENGTH = 36
+"""Largest number of characters in a label of a curve; longer names are shortened."""
+
+
+def projection(
+    solution: Solution,
+    coordinates: Sequence[Coordinate],
+    system: System | None = None,
+    path: str | os.PathLike | None = None,
+    orbit_points: int = 0,
+) -> Figure:
+    """Plot a trajectory, and the coadjoint orbit on which it starts, in two or three chosen coordinates.
+
+    The trajectory is coloured by time. Points of the orbit are grey: images of the initial state under random products
+    of coadjoint actions. A motion that conserves every Casimir stays in the orbit.
+
+    Parameters
+    ----------
+    solution : Solution
+    coordinates : sequence of 2 or 3 int, str or callable
+        Components by their indices, counted from 0, or by the names of the basis elements; or functions of one state,
+        such as an invariant.
+    system : System, optional
+        The system that was integrated; names and the orbit need it.
+    path : path, optional
+        Write the figure to this .pdf, .png or .svg file, and close it.
+    orbit_points : int, >= 0
+        The number of points of the orbit.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    InputError
+        If a coordinate is none of these, or the orbit is asked for without a system on a Lie algebra.
+    FileError
+        If the file cannot be written.
+    """
+    path = checked_figure_path(path)
+    if len(coordinates) not in (2, 3):
+        raise InputError(f"coordinates must be 2 or 3, got {len(coordinates)}")
+    algebra = None if system is None else system.lie_algebra
+    names = None if algebra is None else algebra.basis_names
+    labels, functions = zip(*(_label_and_function(c, solution, names) for c in coordinates), strict=True)
+    figure = plt.figure(figsize=(6.4, 5.2), dpi=DPI, layout="constrained")
+    ax: Any = figure.add_subplot(projection="3d" if len(coordinates) == 3 else None)
+    if orbit_points:
+        if algebra is None:
+            raise InputError("orbit_points needs system=, a system on a Lie algebra")
+        orbit = _points_of_orbit(algebra, solution.x[0, : algebra.dim], orbit_points)
+        padding = np.broadcast_to(solution.x[0, algebra.dim :], (orbit_points, solution.x.shape[1] - algebra.dim))
+        states = np.concatenate([orbit, padding], axis=1)
+        ax.scatter(*(f(states) for f in functions), s=2.0, color="0.75", label="coadjoint orbit")
+    curve = ax.scatter(*(f(solution.x) for f in functions), c=solution.t, s=4.0, cmap="viridis", label="trajectory")
+    figure.colorbar(curve, ax=ax, label="time", shrink=0.8)
+    ax.set(xlabel=labels[0], ylabel=labels[1])
+    if isinstance(ax, Axes3D):
+        ax.set_zlabel(labels[2])
+    ax.legend(loc="upper left", frameon=False, fontsize="small")
+    return save_figure(figure, path)
+
+
+def invariants(solution: Solution, system: System, path: str | os.PathLike | None = None) -> Figure:
+    """Plot how much the energy, the Casimirs and the momentum maps of a run have changed, over time.
+
+    Each curve is the change of one function relative to its largest value, on a logarithmic axis. Changes below
+    rounding are drawn at its level.
+
+    Parameters
+    ----------
+    solution : Solution
+    system : System
+        The system that was integrated.
+    path : path, optional
+        Write the figure to this .pdf, .png or .svg file, and close it.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    InputError
+        If the suffix of ``path`` is another.
+    FileError
+        If the file cannot be written.
+    """
+    path = checked_figure_path(path)
+    functions: dict[str, Callable] = {"energy": system.energy}
+    functions |= {name: function for name, (function, _) in recorded_invariants(system).items()}
+    figure, ax = plt.subplots(figsize=(6.4, 3.6), dpi=DPI, layout="constrained")
+    for i, (name, function) in enumerate(functions.items()):
+        values = np.asarray(jax.vmap(lambda x, f=function: f(x))(jnp.asarray(solution.x)))
+        scale = float(np.abs(values).max()) or 1.0
+        label = name if len(name) <= MAX_LABEL_LENGTH else name[: MAX_LABEL_LENGTH - 1] + "…"
+        change = np.maximum(np.abs(values - values[0]) / scale, EPS)
+        ax.semilogy(solution.t, change, color=COLOURS[i % len(COLOURS)], linewidth=1.0, label=label)
+    ax.set(xlabel="time", ylabel="relative change")
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.legend(frameon=False, fontsize="small")
+    return save_figure(figure, path)
+
+
+def _label_and_function(
+    coordinate: Coordinate, solution: Solution, names: tuple[str, ...] | None
+) -> tuple[str, Callable[[np.ndarray], np.ndarray]]:
+    """Return the label of a coordinate, and the coordinate as a function of states, shape (..., n)."""
+    if callable(coordinate):
+        text = str(coordinate)
+        label = "function of the state" if text.startswith("<") else text
+        return label, lambda x: np.asarray(jax.vmap(coordinate)(jnp.asarray(x)))
+    if isinstance(coordinate, str):
+        if names is None or coordinate not in names:
+            raise InputError(
+                f"{coordinate!r} is not the name of a basis element: they are "
+                f"{', '.join(names) if names else 'not known'}"
+            )
+        coordinate = names.index(coordinate)
+    n = solution.x.shape[1]
+    if isinstance(coordinate, bool) or not isinstance(coordinate, int | np.integer) or not 0 <= coordinate < n:
+        raise InputError(f"a coordinate must be an index from 0 to {n - 1}, a name or a function, got {coordinate!r}")
+    index = int(coordinate)
+    label = names[index] if names is not None and index < len(names) else rf"$\mu_{{{index + 1}}}$"
+    return label, lambda x: x[:, index]
+
+
+def _points_of_orbit(algebra, mu: np.ndarray, count: int) -> np.ndarray:
+    """Return random points of the coadjoint orbit through mu, shape (count, dim)."""
+    directions = jax.random.normal(jax.random.key(0), (ORBIT_FLOWS, count, algebra.dim))
+    points = jnp.broadcast_to(jnp.asarray(mu), (count, algebra.dim))
+    for x in directions:
+        ad_transpose = jnp.swapaxes(algebra.ad(x), -1, -2)
+        points = (jax.scipy.linalg.expm(ad_transpose) @ points[..., None])[..., 0]
+    return np.asarray(points)

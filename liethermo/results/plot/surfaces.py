@@ -1,4 +1,4 @@
-"""Figure of a trajectory on its energy surface and its Casimir surface."""
+"""Figures on surfaces: a trajectory on its energy and Casimir surfaces, a function on the sphere, the Bloch ball."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 from contourpy import contour_generator
+from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -21,10 +22,10 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from scipy.ndimage import map_coordinates
 
 from ...errors import InputError
-from ...systems import System
+from ...systems import QuantumSystem, System
 from ...systems.invariants import recorded_invariants
 from ..solution import Solution
-from .figures import BLUE, DPI, GREY, ORANGE, checked_figure_path, save_figure
+from .figures import BLUE, DPI, GREY, ORANGE, RED, checked_figure_path, save_figure
 
 MAX_SEGMENTS = 20_000
 """Largest number of segments in a 3D figure, each drawn by itself; longer trajectories are thinned."""
@@ -173,13 +174,17 @@ def _conserved_and_changing(solution: Solution, system: System | None) -> tuple[
     return (quantities[0], quantities[1]) if solution.laws.energy == "conserved" else (quantities[1], quantities[0])
 
 
-def _vectorize_in_blocks(function: Callable, block: int = 8192) -> PointFunction:
+VALUES_PER_BLOCK = 8192
+"""Number of points at which a function is evaluated by one call of its program."""
+
+
+def _vectorize_in_blocks(function: Callable) -> PointFunction:
     """Vectorize a function over arrays of points of any shape, in blocks of one size so that it is compiled once."""
     compiled_function = jax.jit(lambda x: function(x))
 
     def evaluate(points: np.ndarray) -> np.ndarray:
         flat = points.reshape(-1, 3)
-        padded = np.concatenate([flat, np.zeros((-len(flat) % block, 3))]).reshape(-1, block, 3)
+        padded = np.concatenate([flat, np.zeros((-len(flat) % VALUES_PER_BLOCK, 3))]).reshape(-1, VALUES_PER_BLOCK, 3)
         return np.concatenate([compiled_function(x) for x in padded])[: len(flat)].reshape(points.shape[:-1])
 
     return evaluate
@@ -343,9 +348,9 @@ def sphere_grid(rows: int, columns: int) -> np.ndarray:
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
 
 
-def _great_circle(normal: np.ndarray, points: int = 360) -> np.ndarray:
-    """Return unit vectors orthogonal to ``normal``, shape (points + 1, 3)."""
-    phi = np.linspace(0, 2 * np.pi, points + 1)[:, None]
+def _great_circle(normal: np.ndarray) -> np.ndarray:
+    """Return unit vectors orthogonal to ``normal``, one a degree, shape (361, 3)."""
+    phi = np.linspace(0, 2 * np.pi, 361)[:, None]
     _, _, (_, a, b) = np.linalg.svd(normal[None])
     return np.cos(phi) * a + np.sin(phi) * b
 
@@ -362,3 +367,119 @@ def _turn_axes_towards(state: np.ndarray, ax: Axes3D) -> None:
     ax.view_init(elev=22.0, azim=azimuth)
     if _view_direction(ax) @ state < 0.0:
         ax.view_init(elev=-22.0, azim=azimuth)
+
+
+def sphere_field(
+    values,
+    path: str | os.PathLike | None = None,
+    ax: Axes | None = None,
+    largest: float | None = None,
+    title: str = "",
+) -> Figure:
+    """Plot a function on the sphere by colours, in a Mollweide projection, which preserves areas.
+
+    Parameters
+    ----------
+    values : array, shape (latitudes, longitudes)
+        Values at colatitudes ``pi (i + 1/2) / latitudes`` from the north and longitudes ``2 pi j / longitudes``, as
+        :meth:`liethermo.models.QuantisedSphere.on_grid` gives them.
+    path : path, optional
+        Write the figure to this .pdf, .png or .svg file, and close it.
+    ax : Axes, optional
+        Draw here, an axes made with ``projection="mollweide"``; by default in a new figure.
+    largest : float, optional
+        The magnitude at which the colours end on both sides of zero; by default that of the values.
+    title : str
+
+    Raises
+    ------
+    InputError
+        If the values are not finite and on a grid, ``ax`` has another projection, or the suffix of ``path`` is another.
+    FileError
+        If the file cannot be written.
+    """
+    path = checked_figure_path(path)
+    field = np.asarray(values)
+    if field.ndim != 2 or min(field.shape) < 2 or field.dtype.kind not in "fiu":
+        raise InputError(f"values must be real numbers of shape (latitudes, longitudes), got shape {np.shape(values)}")
+    if not np.isfinite(field).all():
+        raise InputError("values must be finite")
+    if ax is None:
+        ax = plt.figure(figsize=(6.4, 3.4), dpi=DPI, layout="constrained").add_subplot(projection="mollweide")
+    elif getattr(ax, "name", "") != "mollweide":
+        raise InputError('ax must be made with projection="mollweide"')
+    latitudes, longitudes = field.shape
+    edges = np.linspace(-np.pi, np.pi, longitudes + 1), np.linspace(np.pi / 2, -np.pi / 2, latitudes + 1)
+    colour_limit = float(np.abs(field).max()) if largest is None else largest
+    centred_field = np.roll(field, longitudes // 2, axis=1)  # longitude zero is in the centre
+    picture = ax.pcolormesh(
+        *edges, centred_field, cmap="RdBu_r", vmin=-colour_limit, vmax=colour_limit, rasterized=True
+    )
+    ax.set(xticks=[], yticks=[], title=title)
+    figure = ax.get_figure(root=True)
+    assert figure is not None
+    figure.colorbar(picture, ax=ax, shrink=0.8)
+    return save_figure(figure, path)
+
+
+def bloch_ball(
+    states,
+    system: QuantumSystem,
+    part: int | str = 0,
+    path: str | os.PathLike | None = None,
+    ax: Axes3D | None = None,
+    labels: tuple[str, str] = ("0", "1"),
+) -> Figure:
+    """Plot the states of a qubit in the Bloch ball: a curve that ends in a red point.
+
+    Pure states lie on the sphere, the completely mixed state in its centre. The first level of the Hamiltonian is the
+    north pole, the second one the south pole, as of :meth:`liethermo.QuantumSystem.bloch`.
+
+    Parameters
+    ----------
+    states : Solution, or array, shape (n,) or (..., n)
+        A run, or states; several curves if there are two leading axes, such as the trajectories of an ensemble.
+    system : QuantumSystem
+        The system of the states.
+    part : int or str
+        The qubit, in a product of systems.
+    path : path, optional
+        Write the figure to this .pdf, .png or .svg file, and close it.
+    ax : Axes3D, optional
+        Draw here, an axes made with ``projection="3d"``; by default in a new figure.
+    labels : (str, str)
+        Names of the two levels.
+
+    Raises
+    ------
+    InputError
+        If the system has no qubit with this number, ``ax`` has another projection, or the suffix of ``path`` is
+        another.
+    FileError
+        If the file cannot be written.
+    """
+    path = checked_figure_path(path)
+    if not isinstance(system, QuantumSystem):
+        raise InputError(f"a Bloch ball shows states of an lt.QuantumSystem, not of a {type(system).__name__}")
+    vectors = np.asarray(system.bloch(states.x if isinstance(states, Solution) else states, part))
+    if ax is None:
+        ax = plt.figure(figsize=(4.6, 4.6), dpi=DPI, layout="constrained").add_subplot(projection="3d")
+    elif not isinstance(ax, Axes3D):
+        raise InputError('ax must be made with projection="3d"')
+    x, y, z = np.moveaxis(sphere_grid(24, 36), -1, 0)
+    ax.plot_wireframe(x, y, z, rstride=2, cstride=2, color=GREY, alpha=0.25, linewidth=0.4)
+    angle = np.linspace(0.0, 2.0 * np.pi, 181)
+    ax.plot(np.cos(angle), np.sin(angle), np.zeros_like(angle), color=GREY, linewidth=0.6)
+    for direction in np.eye(3):
+        ax.plot(*np.outer(direction, [-1.0, 1.0]), color=GREY, linewidth=0.6)
+    for curve in vectors.reshape(-1, *vectors.shape[-2:]) if vectors.ndim > 1 else vectors[None, None]:
+        if len(curve) > 1:
+            ax.plot(*curve.T, color=BLUE, linewidth=1.2)
+        ax.scatter(*curve[-1:].T, color=RED, s=22, depthshade=False)
+    ax.text(0.0, 0.0, 1.15, labels[0], ha="center", va="center")
+    ax.text(0.0, 0.0, -1.15, labels[1], ha="center", va="center")
+    ax.set(xlabel="x", ylabel="y", xticks=[-1, 0, 1], yticks=[-1, 0, 1], zticks=[-1, 0, 1], box_aspect=(1, 1, 1))
+    ax.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-1, 1))
+    figure = ax.get_figure(root=True)
+    assert figure is not None
+    return save_figure(figure, path)

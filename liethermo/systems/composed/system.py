@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -14,23 +14,31 @@ import scipy
 import manifolds as mf
 from manifolds._arrays import is_traced
 from manifolds._pytree_module import Module
-from manifolds.structures.extended import StateIndices
+from manifolds.structures.poisson import StateIndices
 
 from ...dissipation.base import Dissipation, nondecreasing_if
-from ...dissipation.bodies import ContactFriction, Drag, HeatConduction, LinearFriction
-from ...dissipation.matter import MatterExchange, Process, conserved_number_combinations
+from ...dissipation.bodies import (
+    ContactFriction,
+    Drag,
+    HeatConduction,
+    LinearFriction,
+    MatterExchange,
+    Process,
+    conserved_number_combinations,
+)
 from ...errors import InputError
-from ...functions.arguments import ConstantFunction, LastArgumentIgnored, required_argument_count
 from ...functions.checks import checked_energy, traced_function_and_shape
 from ...functions.edges import Edges, connected_component_labels, graph_edges
 from ...functions.energy import Energy, Function, Quadratic, TimeDependent
 from ...functions.indices import pattern_of_matrix, sparsity_pattern, union_pattern
 from ...functions.mechanics import is_independent_of, is_mechanical
+from ...functions.time_span import ConstantFunction, LastArgumentIgnored, required_argument_count
 from ..base import System, name_momentum_maps
+from ..domain import Domain
 from ..evolution import entropy_component
+from ..interface import SparseNewton
 from ..states import evaluate_batch
-from .bodies import Copies, Subsystem, name_subsystems
-from .matter import Membrane, Reaction
+from .bodies import Copies, Membrane, Reaction, Subsystem, name_subsystems
 
 
 class ComposedSystem(System):
@@ -94,8 +102,6 @@ class ComposedSystem(System):
     subsystems: tuple[Subsystem | Copies, ...]
     labels: tuple[str, ...] = eqx.field(static=True)
 
-    domain: ClassVar[str] = "positive temperatures"
-
     def __init__(
         self,
         subsystems: Sequence[Subsystem | Copies] | Mapping[str, Subsystem | Copies] | Copies,
@@ -119,7 +125,7 @@ class ComposedSystem(System):
         structure = mf.ExtendedPhaseSpace(dofs, kinds if any(kinds) else ())
         energy = checked_energy(self._total_energy(structure, coupling), structure.dim, "the energy", allow_time=True)
         entropy = entropy_component(structure.dim, structure.state_indices.S)
-        dissipation = self._make_dissipation(structure, energy, conductance, drag, connected, conduction)
+        terms = self._make_dissipations(structure, energy, conductance, drag, connected, conduction)
         exchanges = [*(membranes if isinstance(membranes, list | tuple) else [membranes])]
         exchanges += [*(reactions if isinstance(reactions, list | tuple) else [reactions])]
         for item in exchanges:
@@ -129,10 +135,9 @@ class ComposedSystem(System):
                 )
         processes = [item.process(self.names, structure) for item in exchanges]
         if processes:
-            matter = MatterExchange(processes)
-            dissipation = matter if dissipation is None else dissipation + matter
+            terms.append(MatterExchange(processes))
         momentum_maps = {**_particle_invariants(structure, processes), **name_momentum_maps(momentum_maps)}
-        self._build(structure, structure.dim, energy, entropy, dissipation, momentum_maps, validate)
+        self._build(structure, structure.dim, energy, entropy, terms or None, momentum_maps, validate)
 
     # -- in parts -------------------------------------------------------------------------------------------------
 
@@ -180,7 +185,7 @@ class ComposedSystem(System):
         """
         beta = 1.0 / self.temperatures(x, t)
         factors = jnp.zeros((*beta.shape, beta.shape[-1]))
-        for term in self.dissipations:
+        for term in self.total_dissipation.terms:
             if isinstance(term, HeatConduction):
                 i, j = np.array(term.first_bodies, dtype=int), np.array(term.second_bodies, dtype=int)
                 k = jnp.vectorize(term.conductances, signature="(n),(e),(e)->(e)")(
@@ -190,7 +195,14 @@ class ComposedSystem(System):
                 factors = factors.at[..., i, j].set(factor).at[..., j, i].set(-factor)
         return factors
 
-    def outside(self, x) -> str:
+    @property
+    def domain(self) -> Domain:
+        def lowest_temperature(x):
+            return jnp.min(self.energy.gradient(x)[..., self._state_indices.S])
+
+        return Domain("positive temperatures", self._why_outside, margin=lowest_temperature)
+
+    def _why_outside(self, x) -> str:
         T = np.atleast_2d(self.temperatures(x)).min(axis=0)
         cold = np.flatnonzero(~(T > 0.0))
         if not cold.size:
@@ -201,22 +213,21 @@ class ComposedSystem(System):
             clauses.append(f"of {cold.size - MAX_NAMED_BODIES} more likewise")
         return f"{' and '.join(clauses)}: it has to be positive"
 
-    def domain_margin(self, x):
-        return jnp.min(self.energy.gradient(x)[..., self._state_indices.S])
+    @property
+    def sparse_newton(self) -> SparseNewton:
+        return SparseNewton(self._find_pattern, self._residual_weights)
 
-    def sparsity_pattern(self) -> scipy.sparse.csr_array | None:
+    def _find_pattern(self) -> scipy.sparse.csr_array | None:
         if self.poisson.species:
             return None
-        patterns = [_poisson_pattern(self.poisson)]
-        if self.dissipation is not None:
-            patterns.append(self.dissipation.couplings(self))
-        operator, hessian = union_pattern(patterns), self.energy.couplings(self.dim)
+        patterns = (term.couplings(self) for term in self.total_dissipation.terms)
+        operator, hessian = union_pattern([_poisson_pattern(self.poisson), *patterns]), self.energy.couplings(self.dim)
         if operator is None or hessian is None:
             return None
         identity = scipy.sparse.eye_array(self.dim, dtype=bool, format="csr")
         return pattern_of_matrix((operator + identity) @ (hessian + identity))
 
-    def residual_weights(self, x) -> jax.Array:
+    def _residual_weights(self, x) -> jax.Array:
         """Return temperatures as weights of entropies: ``T S'`` is linear in the temperatures, unlike S'."""
         S = self._state_indices.S
         return jnp.ones_like(x).at[S].set(self.energy.gradient(x)[S])
@@ -243,7 +254,7 @@ class ComposedSystem(System):
             ]
         return sum(terms[1:], terms[0])
 
-    def _make_dissipation(self, structure, energy, conductance, drag, connected, conduction) -> Dissipation | None:
+    def _make_dissipations(self, structure, energy, conductance, drag, connected, conduction) -> list[Dissipation]:
         terms: list[Dissipation] = []
         dofs = structure.degrees_of_freedom
         first_indices = np.cumsum([0, *(body.count for body in self.subsystems)])
@@ -278,7 +289,7 @@ class ComposedSystem(System):
             graph = graph_edges(drag, len(dofs), "the drag", self.names)
             _require_velocities(graph, dofs, self.names)
             terms.append(Drag(graph))
-        return sum(terms[1:], terms[0]) if terms else None
+        return terms
 
     def _friction_surely_produces_entropy(
         self, energy: Energy, structure: mf.ExtendedPhaseSpace, bodies: tuple[int, ...]

@@ -30,10 +30,10 @@ def qubit(coupling=COUPLING, baths=None, rate=RATE):
     return lt.QuantumSystem(TERMS, lt.AdiabaticJumps([(coupling, rate)]), baths=reservoir() if baths is None else baths)
 
 
-def davies_field(rho, H, V, temperature, rate, decimals=9):
+def davies_field(rho, H, V, temperature, rate):
     """Return Lindblad's equation with the components of V in the eigenvectors of H, from its definition."""
     energies, U = np.linalg.eigh(H)
-    gaps, inside = np.round(energies[None, :] - energies[:, None], decimals), U.conj().T @ V @ U
+    gaps, inside = np.round(energies[None, :] - energies[:, None], 9), U.conj().T @ V @ U
     change = -1j * (H @ rho - rho @ H)
     for omega in np.unique(gaps):
         L = U @ np.where(gaps == omega, inside, 0.0) @ U.conj().T

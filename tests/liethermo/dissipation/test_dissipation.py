@@ -45,7 +45,7 @@ REASON_FOR_NO_CASE = {
 def test_every_dissipation_is_a_case_or_has_a_reason():
     classes = [getattr(lt, name) for name in lt.__all__]
     names = {c.__name__ for c in classes if isinstance(c, type) and issubclass(c, lt.Dissipation)}
-    terms = [term for case in DISSIPATIONS for term in build(mf.so(3), case).dissipations]
+    terms = [term for case in DISSIPATIONS for term in build(mf.so(3), case).total_dissipation.terms]
     tested_names = {base.__name__ for term in terms for base in type(term).__mro__}
     missing = names - tested_names - set(REASON_FOR_NO_CASE)
     assert not missing, f"add a case to DISSIPATIONS in tests/cases.py, or a reason here: {sorted(missing)}"

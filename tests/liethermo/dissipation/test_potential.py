@@ -9,7 +9,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.models.gas_piston import gas_piston_state
+from liethermo.models.gases import gas_piston_state
 from tests.cases import DISSIPATIONS, build, energy_of
 from tests.liethermo import random_systems
 from tests.refusals import refusal_test

@@ -15,7 +15,8 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.engines import array_engine
 from liethermo.engines.compiled import machine_code
-from liethermo.engines.compiled.step_loop import CompiledEngine, CompiledStepLoop
+from liethermo.engines.compiled.engine import CompiledEngine
+from liethermo.engines.compiled.step_loop import CompiledStepLoop
 from liethermo.engines.select_engine import CompiledEngineWarning
 from liethermo.engines.solver_options import SolverOptions
 from liethermo.engines.status_codes import StatusCode

@@ -51,8 +51,8 @@ def ring(count, exchange=1.0):
     )
 
 
-def random_spins(count, seed=0):
-    s = np.random.default_rng(seed).standard_normal((count, 3))
+def random_spins(count):
+    s = np.random.default_rng(0).standard_normal((count, 3))
     return np.append((s / np.linalg.norm(s, axis=1)[:, None]).ravel(), 0.0)
 
 

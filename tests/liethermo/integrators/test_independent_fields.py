@@ -72,8 +72,8 @@ def draw_case(seed: int) -> RandomCase:
     quartic, driven = 0.1 * rng.random(), bool(rng.random() < 0.3)
     amplitude, frequency = 0.2 * rng.random(), 1.0 + rng.random()
 
-    def static_energy(x, cosine=jnp.cos):
-        return 0.5 * x @ (A @ x) + b @ x + 0.3 * cosine(c @ x) + quartic * (d @ x) ** 4
+    def static_energy(x):
+        return 0.5 * x @ (A @ x) + b @ x + 0.3 * jnp.cos(c @ x) + quartic * (d @ x) ** 4
 
     def energy(x, t):
         return static_energy(x) + amplitude * jnp.cos(frequency * t) * (c @ x)

@@ -9,7 +9,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines.step import initial_run_state, take_step
-from liethermo.integrators.lobatto import (
+from liethermo.integrators.tableaus import (
     LOBATTO_ORDERS,
     ErrorEstimate,
     ExplicitTableau,

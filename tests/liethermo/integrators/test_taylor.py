@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.integrators.lobatto import lobatto_rule
+from liethermo.integrators.tableaus import lobatto_rule
 from tests.liethermo.integrators.test_on_manifolds import CASES, starts
 from tests.liethermo.integrators.test_orders import NONLINEAR
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
-from liethermo.models.mass_spring_gas import CASES, STARTS, mass_spring_gas_solution
+from liethermo.models.gases import CASES, STARTS, mass_spring_gas_solution
 from liethermo.tracing.interpret import evaluate_at_points
 from tests.liethermo.closed_systems import ISOLATED_SYSTEMS, OPEN, SCHEMES, X0
 from tests.refusals import refusal_test

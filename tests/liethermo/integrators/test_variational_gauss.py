@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
-from liethermo.models.mass_spring_gas import mass_spring_gas_solution
+from liethermo.models.gases import mass_spring_gas_solution
 from tests.liethermo.closed_systems import OPEN, X0
 
 HOT = {"friction": 2.0, "moles": 0.001}

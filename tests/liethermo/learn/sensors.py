@@ -69,10 +69,10 @@ def pendulum_equations(t, state):
     return [velocity, acceleration, DAMPING * velocity**2 / CAPACITY]
 
 
-def warm_pendulum(seed=0, end=20.0, number=300) -> dict[str, np.ndarray]:
+def warm_pendulum(seed=0) -> dict[str, np.ndarray]:
     """Return times (s), angles (deg) and temperatures (degC); nine of ten temperatures are missing."""
     random = np.random.default_rng(seed)
-    t = irregular_times(end, number, random)
+    t = irregular_times(20.0, 300, random)
     state = _solve(pendulum_equations, (1.2, 0.0, ROOM_TEMPERATURE), t)
     angle = np.degrees(state[:, 0]) + ANGLE_NOISE * random.standard_normal(len(t))
     temperature = state[:, 2] - 273.15 + TEMPERATURE_NOISE * random.standard_normal(len(t))

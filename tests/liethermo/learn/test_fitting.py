@@ -219,9 +219,9 @@ def test_a_loss_that_is_not_finite_is_an_error():
         lt.learn.fit(system, (t, x), matching=50, shooting=0)
 
 
-def _attitudes(noise, seed=0):
+def _attitudes(noise):
     """Records of the attitudes of a body with friction inside, each turned by a small random angle."""
-    body, random, observations = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.08), np.random.default_rng(seed), []
+    body, random, observations = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.08), np.random.default_rng(0), []
     for start in random.standard_normal((4, 3)):
         run = lt.integrate(body, start, (0.0, 8.0), 0.05, method=lt.MetriplecticRungeKutta(6), save_every=4)
         noise_rotations = mf.SO(3).exp(noise * random.standard_normal((len(run.t), 3)))

@@ -9,12 +9,10 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.learn.networks import learned_mask
+from liethermo.learn.parts import learned_mask
 from liethermo.runs.preparation import prepare_for_method
 
 from . import cases
-
-LAWS = ("Pi skew", "Pi grad S = 0", "K symmetric", "K grad H = 0", "K >= 0", "energy law", "entropy law")
 
 
 def _failed_axioms(system):

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 import liethermo as lt
-from liethermo.engines.compiled.step_loop import CompiledEngine
+from liethermo.engines.compiled.engine import CompiledEngine
 from liethermo.models.orbits import eccentric_anomaly, rotate
 from liethermo.runs.preparation import prepare_system_and_method
 from tests.refusals import refusal_test

@@ -1,10 +1,11 @@
-"""Histories of attitudes in CSV files: round trips, and files of others."""
+"""Attitudes in files and ensembles: CSV histories with units in the names of columns, and what cannot be used."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 import liethermo as lt
+import manifolds as mf
 
 
 @pytest.fixture(scope="module")
@@ -90,3 +91,53 @@ def test_what_cannot_be_written(run, tmp_path):
     lt.bodies.write_csv(tmp_path / "one.csv", many[1])
     with pytest.raises(lt.InputError, match="no attitudes"):
         lt.bodies.write_csv(tmp_path / "x.csv", lt.integrate(lt.models.rigid_body(), [1.0, 0, 0], (0.0, 0.1), 0.1))
+
+
+@pytest.mark.slow
+def test_complex_groups_and_files(tmp_path):
+    """On SU(2), with complex elements, a full turn gives -I; a file stores the attitudes."""
+    system = lt.LiePoissonSystem(mf.su(2), lt.Quadratic(np.ones(3)), group=mf.SU(2))
+    run = lt.integrate(system, [0.0, 0.0, 1.0], (0.0, 2 * np.pi), np.pi / 200, lt.MetriplecticGauss(2), engine="array")
+    assert np.abs(run.attitude[-1] + np.eye(2)).max() < 1e-7
+    loaded = lt.load(run.save(tmp_path / "run.nc"))
+    assert np.array_equal(loaded.attitude, run.attitude)
+    su3 = lt.LiePoissonSystem(mf.su(3), lt.Quadratic(np.arange(1.0, 9.0)), group=mf.SU(3))
+    run = lt.integrate(su3, np.ones(8), (0.0, 1.0), 0.1, engine="array")
+    assert np.asarray(mf.SU(3).belongs(run.attitude, 1e-14)).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", [pytest.param("array", marks=pytest.mark.slow), "compiled"])
+def test_ensembles_carry_attitudes(engine):
+    """Each member equals a single run; one momentum may have several attitudes, and summaries have none."""
+    system = lt.LiePoissonSystem(
+        mf.so(3),
+        lt.Quadratic(1.0 / np.array([3.0, 2.0, 1.0])),
+        lt.Quadratic(np.ones(3)),
+        lt.KillingDissipation(0.1),
+        group=mf.SO(3),
+    )
+    rng = np.random.default_rng(0)
+    mu, g = rng.standard_normal((4, 3)), mf.SO(3).exp(rng.standard_normal((4, 3)))
+    ensemble = lt.ensemble(system, mu, (0.0, 2.0), 0.1, attitude=g, outputs="trajectory", engine=engine)
+    assert (ensemble.x.shape, ensemble.attitude.shape) == ((4, 21, 3), (4, 21, 3, 3))
+    single_run = lt.integrate(system, mu[2], (0.0, 2.0), 0.1, attitude=g[2])
+    assert np.abs(ensemble.attitude[2] - single_run.attitude).max() < 1e-13
+    assert np.abs(ensemble.x[2] - single_run.x).max() < 1e-13
+    common_momentum = lt.ensemble(system, mu[2], (0.0, 2.0), 0.1, attitude=g, engine=engine)
+    assert (
+        np.abs(common_momentum.attitude @ mf.SO(3).inverse(g) @ g[2] - common_momentum.attitude[2]).max() > 1e-3
+    )  # g acts from the left
+    assert np.abs(g[2] @ mf.SO(3).inverse(g) @ common_momentum.attitude - common_momentum.attitude[2]).max() < 1e-13
+    assert lt.ensemble(system, mu, (0.0, 2.0), 0.1, outputs="summary", engine=engine).attitude is None
+
+
+def test_attitudes_that_cannot_be_used():
+    without_group = lt.models.free_rigid_body()
+    with pytest.raises(lt.InputError, match=r"group=mf\.SO\(3\)"):
+        lt.ensemble(without_group, [1.0, 0.0, 0.0], (0.0, 1.0), 0.1, attitude=np.eye(3))
+    with_group = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(np.ones(3)), group=mf.SO(3))
+    with pytest.raises(lt.InputError, match="one attitude"):
+        lt.integrate(with_group, [1.0, 0.0, 0.0], (0.0, 1.0), 0.1, attitude=np.stack([np.eye(3)] * 2))
+    with pytest.raises(lt.InputError, match=r"not in SO\(3\)"):
+        lt.ensemble(with_group, np.eye(3), (0.0, 1.0), 0.1, attitude=np.stack([np.eye(3), np.eye(3), 2 * np.eye(3)]))

@@ -50,7 +50,7 @@ def test_the_picture_of_a_solution_holds_its_curves(solution):
 
 
 def test_a_picture_of_what_is_not_finite_or_long_is_still_one():
-    from liethermo.results.sketch import MAX_POINTS, svg_sketch
+    from liethermo.results.solution import MAX_POINTS, svg_sketch
 
     t = np.arange(5000.0)
     series = np.stack([np.sin(t), np.full_like(t, np.nan)], axis=-1)

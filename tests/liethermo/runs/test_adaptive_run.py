@@ -11,9 +11,9 @@ from scipy.integrate import solve_ivp
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines import array_engine
-from liethermo.engines.compiled import step_loop as compiled
-from liethermo.engines.growth_rate import arnoldi_hessenberg
-from liethermo.engines.step_control import step_size_after_acceptance, step_size_after_rejection
+from liethermo.engines.compiled.engine import CompiledEngine
+from liethermo.engines.compiled.step_loop import CompiledStepLoop
+from liethermo.engines.step_control import arnoldi_hessenberg, step_size_after_acceptance, step_size_after_rejection
 from liethermo.runs import adaptive_run
 from liethermo.tracing.scalarize import UnsupportedPrimitive
 from tests.systems import rigid_body
@@ -94,7 +94,7 @@ def test_the_estimate_scales_with_the_motion():
     ratios = []
     for amplitude in (1e-1, 1e-3, 1e-5):
         x = np.array([amplitude, 0.0, 1.0])
-        new, right = (e.step(e.initial_run_state(x), h) for e in (compiled.CompiledEngine(body, m) for m in methods))
+        new, right = (e.step(e.initial_run_state(x), h) for e in (CompiledEngine(body, m) for m in methods))
         estimate = method.error(body, x, np.zeros(3), h, new.k)
         ratios.append(float(estimate) / np.abs(new.x - right.x).max())
     assert max(ratios) < 1.5 * min(ratios), ratios
@@ -177,7 +177,7 @@ def test_the_array_engine_takes_over_amid_attempts_made_together(monkeypatch):
         raise UnsupportedPrimitive("newton", "in this test")
 
     array_run = run_with_engine("array")
-    monkeypatch.setattr(compiled.CompiledStepLoop, "_newton_address", solver)
+    monkeypatch.setattr(CompiledStepLoop, "_newton_address", solver)
     with pytest.warns(UserWarning, match="newton"):
         parts = run_with_engine("auto")
     assert calls

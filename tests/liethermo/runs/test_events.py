@@ -8,7 +8,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines import step_control
+from liethermo.engines import adaptive_steps
 from liethermo.engines.root_bracket import first_event_ends
 from tests.systems import oscillator, rigid_body
 
@@ -49,7 +49,7 @@ def test_the_first_of_several_in_a_step_is_found(method, until, engine):
 
 
 def test_control_without_looks_a_later_one_is_taken_for_the_first(monkeypatch):
-    monkeypatch.setattr(step_control, "event_check_fractions", lambda order: np.zeros(0))
+    monkeypatch.setattr(adaptive_steps, "event_check_fractions", lambda order: np.zeros(0))
     method = lt.MetriplecticTaylor(19)  # which nothing has been compiled for
     arguments = (0.0, 8.0), lt.Adaptive(1e-9), method
     assert (

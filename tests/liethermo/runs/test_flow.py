@@ -11,8 +11,8 @@ import scipy.optimize
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.engines.implicit_differentiation import implicit_solution
 from liethermo.runs import flow as flow_module
+from liethermo.runs.flow_derivatives import implicit_solution
 
 X0 = jnp.array([0.3, 1.0, 0.2])
 PARAMETERS = jnp.array([10.0, 5.0, 1.0, 1.0])

@@ -11,8 +11,8 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.engines.select_engine import EngineWithFallback
 from liethermo.integrators.fluctuating import noise_dimension, with_noise_increments
-from liethermo.models.gas_piston import gas_piston_state
-from liethermo.runs.threefry import threefry
+from liethermo.models.gases import gas_piston_state
+from liethermo.runs.noise import threefry
 from liethermo.tracing import programs
 from tests.cases import BuiltOnUse
 

@@ -13,8 +13,8 @@ import pytest
 
 import liethermo as lt
 from liethermo.cli import app
-from liethermo.studies import files
 from liethermo.studies import store as stores
+from liethermo.studies import store_metadata
 from liethermo.studies.store_metadata import CHECKSUM_ATTRIBUTE, with_checksum
 from liethermo.studies.store_results import audit_store, load_status, load_study
 
@@ -256,7 +256,7 @@ def test_the_loser_of_a_race_for_a_store_is_told(tmp_path, monkeypatch):
     def rename_too_late(source, target):
         monkeypatch.undo()
         study(path).run()
-        locks.enter_context(files.lock_store(path))(4)
+        locks.enter_context(store_metadata.lock_store(path))(4)
         rename(source, target)
 
     monkeypatch.setattr(stores.os, "rename", rename_too_late)
@@ -270,7 +270,7 @@ def test_a_store_that_cannot_be_made_leaves_nothing(tmp_path, monkeypatch):
     def full(*arguments):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(files.disk.os, "replace", full)
+    monkeypatch.setattr(store_metadata.disk.os, "replace", full)
     with pytest.raises(lt.FileError, match=r"cannot make the store .*store\.zarr: the disk is full"):
         study(tmp_path / "store.zarr").run()
     assert os.listdir(tmp_path) == []

@@ -16,7 +16,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo import disk
-from liethermo.studies import files
+from liethermo.studies import store_metadata
 from liethermo.studies.running import run_locally
 
 from .cases import RATES, RATIOS, X0, body, content, study
@@ -349,7 +349,7 @@ def test_a_full_disk_is_said_and_loses_nothing(finished_study, tmp_path, monkeyp
 
 def test_two_runs_at_once_and_a_status_from_outside(finished_study, tmp_path):
     store = finished_study[0]
-    with files.lock_store(store) as record_run:
+    with store_metadata.lock_store(store) as record_run:
         record_run(0)
         with pytest.raises(lt.FileError, match=f"another run works on .*process {os.getpid()} on"):
             study(store).run()

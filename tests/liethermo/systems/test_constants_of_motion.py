@@ -30,10 +30,10 @@ def total(x):
     return jnp.sum(x)
 
 
-def system_in_ball(preserve=(total,), dissipation=None):
+def system_in_ball(dissipation=None):
     """Friction that keeps the sum."""
     dissipation = (
-        lt.ProjectedMetric(preserve=preserve, rate=0.3, normalized=True) if dissipation is None else dissipation
+        lt.ProjectedMetric(preserve=(total,), rate=0.3, normalized=True) if dissipation is None else dissipation
     )
     energy = lambda x: x @ jnp.array([1.0, 2.0, 4.0])  # noqa: E731
     return lt.MetriplecticSystem(None, energy, log_inside_ball, dissipation, dim=3, validate=False)

@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import liethermo as lt
-from liethermo.engines.sparse import colouring_and_lu
+from liethermo.engines import sparse_engine
 from liethermo.functions.gradients import DISCRETE_GRADIENTS, stage_gradients
 from liethermo.integrators.tableaus import gauss_tableau
-from liethermo.models.heat_grid import grid_adjacency_matrix, heat_grid_solution
+from liethermo.models.thermo_particles import grid_adjacency_matrix, heat_grid_solution
 from tests.cases import tolerance
 from tests.refusals import refusal_test
 
@@ -41,9 +41,9 @@ def star_and_ring(n):
     return [(0, i, 1.0) for i in range(1, n)] + ring
 
 
-def network(n=6, seed=0):
+def network(n=6):
     """Bodies on a line with springs, friction, drag and heat; everything random."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     bodies = lt.Copies(
         n, cart_energy, 3, (rng.uniform(0.5, 2.0, n), rng.uniform(0.5, 2.0, n)), friction=rng.random((n, 1))
     )
@@ -53,8 +53,8 @@ def network(n=6, seed=0):
     return lt.ComposedSystem(bodies, springs, star_and_ring(n), drag, validate=False)
 
 
-def random_state(n, seed=0):
-    return 0.5 * np.random.default_rng(seed).standard_normal(3 * n)
+def random_state(n):
+    return 0.5 * np.random.default_rng(0).standard_normal(3 * n)
 
 
 def assert_both_laws(solution, content=0.0):
@@ -158,10 +158,10 @@ def test_the_compressed_jacobian_is_the_jacobian(method):
     """With a hub that is found by pulling back; and every entry of the pattern is one that can occur."""
     n, h = 12, 0.1
     system = network(n)
-    pattern, x = system.sparsity_pattern(), jnp.asarray(random_state(n))
+    pattern, x = system.sparse_newton.find_pattern(), jnp.asarray(random_state(n))
     slopes = eqx.filter_jit(lambda k: method.slopes(system, x, 0.0 * x, h, k))
     k = jnp.asarray(np.random.default_rng(1).standard_normal((method.stages, 3 * n)))
-    compression = colouring_and_lu.JacobianCompression(pattern, method.stages)
+    compression = sparse_engine.JacobianCompression(pattern, method.stages)
     assert 0 < len(compression.dense_rows) < 6
     assert compression.n_derivatives < 0.8 * k.size
     push = jax.jit(lambda seed: jax.jvp(slopes, (k,), (seed,))[1])
@@ -180,11 +180,11 @@ def test_colours(seed):
     """No row has two columns of one colour, and a plane grid needs few."""
     rng = np.random.default_rng(seed)
     pattern = scipy.sparse.random_array((40, 40), density=0.1, rng=rng, format="csr") + scipy.sparse.eye_array(40)
-    compression = colouring_and_lu.JacobianCompression(scipy.sparse.csr_array(pattern))
+    compression = sparse_engine.JacobianCompression(scipy.sparse.csr_array(pattern))
     for i in set(range(40)) - set(compression.dense_rows.tolist()):
         colours = compression.colours[pattern.indices[pattern.indptr[i] : pattern.indptr[i + 1]]]
         assert len(set(colours)) == len(colours)
-    grid = colouring_and_lu.JacobianCompression(
+    grid = sparse_engine.JacobianCompression(
         scipy.sparse.csr_array(grid_adjacency_matrix((9, 9)) + scipy.sparse.eye_array(81))
     )
     assert grid.n_derivatives <= 9
@@ -193,19 +193,19 @@ def test_colours(seed):
 
 @pytest.mark.parametrize("widest", [1000, 0], ids=["factorised", "Krylov"])
 def test_inverses(widest, monkeypatch):
-    monkeypatch.setattr(colouring_and_lu, "MAX_FRONT_WIDTH", widest)
+    monkeypatch.setattr(sparse_engine, "MAX_FRONT_WIDTH", widest)
     rng = np.random.default_rng(0)
     A = scipy.sparse.csc_array(scipy.sparse.eye_array(50) + 3.0 * grid_laplacian((5, 10)))
     x = rng.standard_normal(50)
-    assert np.abs(colouring_and_lu.SparseInverse(A, 5)(A @ x) - x).max() < (1e-13 if widest else 1e-4)
+    assert np.abs(sparse_engine.SparseInverse(A, 5)(A @ x) - x).max() < (1e-13 if widest else 1e-4)
     bad = A.copy()
     bad.data[3] = np.nan
     with pytest.raises(np.linalg.LinAlgError, match="not finite"):
-        colouring_and_lu.SparseInverse(bad, 5)
+        sparse_engine.SparseInverse(bad, 5)
 
 
 test_a_singular_matrix = refusal_test(
-    (lambda: colouring_and_lu.SparseInverse(scipy.sparse.csc_array(np.diag([1.0, 0.0])), 1), "singular"),
+    (lambda: sparse_engine.SparseInverse(scipy.sparse.csc_array(np.diag([1.0, 0.0])), 1), "singular"),
     error=np.linalg.LinAlgError,
 )
 
@@ -236,7 +236,7 @@ def test_every_solver_solves_the_same_steps(monkeypatch):
     system, x0 = lt.models.heat_grid((5, 4)), np.log(np.random.default_rng(0).uniform(200.0, 400.0, 20))
     dense = lt.integrate(system, x0, (0.0, 10.0), 2.0, engine="array")
     factorised = lt.integrate(system, x0, (0.0, 10.0), 2.0, engine="sparse")
-    monkeypatch.setattr(colouring_and_lu, "MAX_FRONT_WIDTH", 0)
+    monkeypatch.setattr(sparse_engine, "MAX_FRONT_WIDTH", 0)
     krylov = lt.integrate(system, x0, (0.0, 10.0), 2.0, engine="sparse")
     assert dense.stats.newton_iterations > 0
     assert krylov.stats.newton_iterations > 0
@@ -259,7 +259,7 @@ def test_the_sparse_engine_needs_a_sparsity():
     """The sparse one, asked for where the sparsity is not known: an error says why."""
     bodies = [lt.Subsystem(lambda x: jnp.exp(x[0]), 1) for _ in range(2)]
     coupled = lt.ComposedSystem(bodies, lt.Function(lambda y: y[0] ** 2).on(lambda x: x[:1] - x[1:]), 1.0)
-    assert coupled.sparsity_pattern() is None
+    assert coupled.sparse_newton.find_pattern() is None
     with pytest.raises(
         lt.InputError, match=r"does not know its sparsity\. Build the system as a ComposedSystem of lt\.Copies"
     ):

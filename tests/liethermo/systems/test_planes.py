@@ -13,7 +13,7 @@ from liethermo.engines import array_engine
 from liethermo.engines.solver_options import DEFAULT_OPTIONS
 from liethermo.engines.step import initial_run_state_program, reorder_components, take_step
 from liethermo.functions.gradients import DISCRETE_GRADIENTS, stage_gradients
-from liethermo.functions.planes import to_component_order, to_site_order
+from liethermo.functions.on_spaces import to_component_order, to_site_order
 from liethermo.integrators.base import pullback_method
 from liethermo.integrators.tableaus import gauss_tableau, kronrod_rule
 from liethermo.systems.spins import reorder_spins

@@ -9,7 +9,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.systems.invariants import conserves, preserved_names
-from liethermo.testing.runs import rebuild_pytree
+from liethermo.testing.suites import rebuild_pytree
 from liethermo.tracing.interpret import evaluate_at_points
 from tests.cases import DISSIPATIONS, build, slow_case
 from tests.liethermo.closed_systems import ISOLATED_SYSTEMS

@@ -441,8 +441,17 @@ def test_ratios_and_sites_of_the_structure_are_checked():
 class IteratedRotation(lt.SpinSystem):
     """Control: what noise turns is left to the iteration."""
 
-    def solve_rotation(self, angles, v):
-        return v
+    def solve_at_spins(self, x, dH, noise_rates, half_step, velocities):
+        return sum(velocities)
+
+
+class NoiseAlone(lt.SpinSystem):
+    """Control: only the turn by noise is solved for at once."""
+
+    def solve_at_spins(self, x, dH, noise_rates, half_step, velocities):
+        a, v = half_step * noise_rates, sum(velocities)
+        matrices = jnp.eye(3) - jnp.stack([jnp.cross(a, e) for e in np.eye(3)], axis=-1)
+        return jnp.append(jnp.linalg.solve(matrices, v[:-1].reshape(-1, 3, 1)), v[-1])
 
 
 class Unsaid(lt.LandauLifshitz):
@@ -465,11 +474,33 @@ def test_what_noise_turns_a_step_solves_for_at_once():
     assert np.ptp(at_once.x[:, 0]) > 0.05
     assert at_once.stats.newton_iterations == 0
     assert 2 * at_once.stats.fixed_point_iterations < control.stats.fixed_point_iterations
-    angles, v = RANDOM.standard_normal((64, 3)), RANDOM.standard_normal(system.dim)
-    u = np.asarray(lt.SpinSystem.solve_rotation(system, angles, v))
-    left = u[:-1] - np.cross(angles, u[:-1].reshape(-1, 3)).ravel()
-    assert np.abs(left - v[:-1]).max() < 1e-14
-    assert u[-1] == v[-1]
+
+
+@pytest.mark.parametrize(("step", "needs_newton"), [(0.02, False), (0.06, True)])
+def test_precession_and_damping_of_each_spin_are_solved_for_at_once(step, needs_newton):
+    """The control takes a fifth more iterations in short steps, and Newton's method in long ones."""
+    sites, bath, runs = (4, 4, 4), lt.HeatBaths(np.inf, 1.4), []
+    for kind in (lt.SpinSystem, NoiseAlone):
+        system = kind(sites, lt.magnetism.exchange(sites, 1.0), lt.LandauLifshitz(2.0), bath)
+        start = system.state(np.tile([0.0, 0.0, 1.0], (*sites, 1)))
+        runs.append(lt.integrate(system, start, (0.0, 10 * step), step, noise=lt.Fluctuations(1.0, 3), engine="array"))
+    at_once, control = runs
+    assert np.abs(at_once.x - control.x).max() < 1e-11
+    assert at_once.stats.newton_iterations == 0
+    if needs_newton:
+        assert control.stats.newton_iterations > 50
+    else:
+        assert 1.2 * at_once.stats.fixed_point_iterations < control.stats.fixed_point_iterations
+
+
+def test_equations_of_each_spin_have_the_derivative_of_its_velocity():
+    """Compared with the derivative of the vector field of one spin, less the part that changes its length."""
+    spin = lt.SpinSystem(1, lt.magnetism.zeeman(1, [0.3, 0.5, 1.0]), lt.LandauLifshitz(0.7), ratio=1.3)
+    s, v, w = unit(1).ravel(), *RANDOM.standard_normal((2, 3))
+    dH, h = np.array([-0.3, -0.5, -1.0]), 0.2
+    u = np.asarray(spin.solve_at_spins(s, dH, w[None], h, [v]))
+    derivative = jax.jvp(lambda s: spin.vector_field(s) + jnp.cross(w, s), (s,), (u,))[1] + 0.7 * dH * (s @ u)
+    assert np.abs(u - h * np.asarray(derivative) - v).max() < 1e-14
 
 
 FIELDS = np.array([0.5, 2.0, 5.0])

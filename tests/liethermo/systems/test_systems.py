@@ -15,6 +15,7 @@ from scipy.integrate import solve_ivp
 import liethermo as lt
 import manifolds as mf
 from liethermo.integrators import registered_methods
+from liethermo.systems import Domain
 from liethermo.systems.check import MAX_FULL_JACOBI_DIM
 from tests.cases import energy_of, state_of
 
@@ -326,12 +327,11 @@ def test_the_report_counts_points_outside_the_domain():
 
 
 class Unstartable(lt.LiePoissonSystem):
-    def why_singular(self, x):
-        return "its gradient is infinite"
+    domain = Domain(why_singular=lambda x: "its gradient is infinite")
 
 
 class UnstartableOnASpace(lt.MetriplecticSystem):
-    why_singular = Unstartable.why_singular
+    domain = Unstartable.domain
 
 
 def test_what_a_system_says_of_first_states_is_heard_through_what_it_is_run_as():

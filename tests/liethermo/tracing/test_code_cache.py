@@ -14,8 +14,8 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from liethermo.engines.compiled import machine_code
-from liethermo.tracing import code_cache, programs
-from liethermo.tracing.code_cache import CacheWarning
+from liethermo.tracing import programs
+from liethermo.tracing.programs import CacheWarning
 from tests.liethermo.tracing.test_scalarize import program_of
 from tests.machine_code import compile_program as compiled
 
@@ -23,7 +23,7 @@ from tests.machine_code import compile_program as compiled
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.setenv("LIETHERMO_CACHE", str(tmp_path / "cache"))
-    code_cache._warn_untrusted.cache_clear()
+    programs._warn_untrusted.cache_clear()
     return tmp_path / "cache"
 
 
@@ -163,7 +163,7 @@ def test_without_a_home(tmp_path, has_xdg_cache):
 
 def test_a_folder_that_cannot_be_made_is_no_fault(monkeypatch, compilations):
     for folder_name in ("/dev/null/cache", "a\0b"):
-        monkeypatch.setattr(code_cache, "cache_folder", lambda where=folder_name: code_cache.Path(where))
+        monkeypatch.setattr(programs, "cache_folder", lambda where=folder_name: programs.Path(where))
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             run()

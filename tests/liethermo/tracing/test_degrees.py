@@ -9,7 +9,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.tracing.degrees import array_degree_bound
+from liethermo.tracing.interpret import array_degree_bound
 from liethermo.tracing.scalarize import scalarize
 
 A = np.random.default_rng(0).standard_normal((4, 3, 3))

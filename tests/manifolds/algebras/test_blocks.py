@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 import manifolds as mf
-from manifolds.algebras.blocks import direct_sum_by_constants, merged_direct_sum
-from manifolds.algebras.sums import MAX_DIM_BY_CONSTANTS
+from manifolds.algebras.blocks import MAX_DIM_BY_CONSTANTS, direct_sum_by_constants, merged_direct_sum
 
 MIXED_SUMMANDS = [mf.so(3), mf.so(3), mf.heisenberg(1), mf.sl(2), mf.so(3)]
 

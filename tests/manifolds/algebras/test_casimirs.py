@@ -12,7 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import manifolds as mf
-from manifolds.algebras import _null_space as linear
+from manifolds.algebras import _subspaces as linear
 from manifolds.algebras import polynomial_casimirs as module
 from manifolds.algebras.polynomial import Polynomial
 from tests.cases import ALGEBRAS
@@ -29,9 +29,9 @@ def casimirs(g, degree):
         return g.casimirs(degree)
 
 
-def invariance_residual(g, F, seed=0):
+def invariance_residual(g, F):
     """Return the largest |ad*_{grad F} mu| / (|grad F| |mu|) at random points."""
-    mu = jnp.asarray(np.random.default_rng(seed).standard_normal((20, g.dim)))
+    mu = jnp.asarray(np.random.default_rng(0).standard_normal((20, g.dim)))
     gradient = jax.vmap(jax.grad(F))(mu)
     size = jnp.linalg.norm(gradient, axis=1) * jnp.linalg.norm(mu, axis=1)
     return float(jnp.max(jnp.linalg.norm(g.ad_star(gradient, mu), axis=1) / size))

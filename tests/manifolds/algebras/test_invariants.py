@@ -9,8 +9,8 @@ import pytest
 
 import manifolds as mf
 from manifolds.algebras import polynomial_casimirs as module
+from manifolds.algebras.casimirs import fundamental_invariants
 from manifolds.algebras.catalogue import _OCTONIONS
-from manifolds.algebras.invariants import fundamental_invariants
 from tests.cases import slow_case
 
 

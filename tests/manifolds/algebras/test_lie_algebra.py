@@ -14,8 +14,8 @@ seeds = st.integers(0, 10**6)
 each_algebra = pytest.mark.parametrize("g", ALGEBRAS, ids=algebra_id)
 
 
-def random_elements(g, seed, count, shape=()):
-    return np.random.default_rng(seed).standard_normal((count, *shape, g.dim))
+def random_elements(g, seed, count):
+    return np.random.default_rng(seed).standard_normal((count, g.dim))
 
 
 def is_close(a, b, scale=1.0):

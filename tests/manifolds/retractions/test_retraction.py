@@ -9,6 +9,7 @@ import pytest
 
 import manifolds as mf
 from liethermo.tracing.scalarize import scalarize
+from tests.cases import max_abs
 
 TOLERANCES = {
     # name: (bound, what was measured and why)
@@ -41,10 +42,6 @@ CASES = [
     ("cayley", SO3 * R3, 3, True),
     ("cayley", SO3**2, 3, True),
 ]
-
-
-def max_abs(a) -> float:
-    return float(np.abs(np.asarray(a)).max(initial=0.0))
 
 
 def is_close(a, b, name="exact", scale=1.0) -> bool:

@@ -12,6 +12,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
+from tests.cases import max_abs
 
 TOLERANCES = {
     # name: (bound, what was measured and why)
@@ -25,10 +26,6 @@ TOLERANCES = {
 
 def tolerance(name: str) -> float:
     return TOLERANCES[name][0]
-
-
-def max_abs(a) -> float:
-    return float(np.abs(np.asarray(a)).max(initial=0.0))
 
 
 # -- derivatives at equal points ---------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import manifolds as mf
+from tests.cases import max_abs
 
 TOLERANCES = {
     # name: (bound, what was measured and why)
@@ -22,10 +23,6 @@ TOLERANCES = {
     "derivative": (3e-12, "against the native space: differences with a rounding of 1e-16 / 0.02; at most 6e-13 seen"),
 }
 BATCH_SIZE = 2
-
-
-def max_abs(a) -> float:
-    return float(np.abs(np.asarray(a)).max(initial=0.0))
 
 
 def is_close(a, b, name="value") -> bool:

@@ -126,10 +126,10 @@ def test_structure_factors_by_transforms_are_direct_sums():
     assert mag.structure_factor(t, square).trace.sum() == pytest.approx(np.sum(t**2))
 
 
-def skyrmion(n, radius, vorticity=1, core=-1.0):
+def skyrmion(n, radius, vorticity=1):
     x, y = np.meshgrid(np.arange(n) - n / 2 + 0.5, np.arange(n) - n / 2 + 0.5, indexing="ij")
     r, phi = np.hypot(x, y), np.arctan2(y, x)
-    theta = np.where(core < 0, np.pi, 0.0) + (-1 if core < 0 else 1) * np.pi * np.clip(r / radius, 0.0, 1.0)
+    theta = np.pi - np.pi * np.clip(r / radius, 0.0, 1.0)
     return np.stack(
         [np.sin(theta) * np.cos(vorticity * phi), np.sin(theta) * np.sin(vorticity * phi), np.cos(theta)], axis=-1
     )

@@ -10,10 +10,10 @@ mag = lt.magnetism
 RANDOM = np.random.default_rng(7)
 
 
-def vectors_with_memory(count: int, memory: float, scale: float = 1.0) -> np.ndarray:
+def vectors_with_memory(count: int, memory: float) -> np.ndarray:
     """Return normal vectors with the correlation ``memory**lag``, shape (count, 3)."""
-    noise = scale * np.sqrt(1.0 - memory**2) * RANDOM.standard_normal((count, 3))
-    x = [scale * RANDOM.standard_normal(3)]
+    noise = np.sqrt(1.0 - memory**2) * RANDOM.standard_normal((count, 3))
+    x = [RANDOM.standard_normal(3)]
     for w in noise:
         x.append(memory * x[-1] + w)
     return np.array(x[1:])

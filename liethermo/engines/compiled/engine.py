@@ -1,0 +1,383 @@
+"""Compiled engine: a user's plain functions as machine code, for small systems on the CPU.
+
+The steps of the array engine, for one system and method, are traced, unrolled to scalar programs (:mod:`liethermo.
+tracing.scalarize`) and placed in a loop over steps (:mod:`.step_loop`) that LLVM compiles. The system's parameters (the
+arrays among its leaves) stay arguments: a sweep compiles once. Machine code is cached on disk for other processes.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+
+from ...integrators import OneStepMethod
+from ...systems import System
+from ...tracing.scalarize import UnsupportedPrimitive
+from ..array_engine import max_saves_per_call
+from ..solver_options import DEFAULT_OPTIONS, SolverOptions
+from ..step import SavedStates, State
+from ..step_control import StepControl
+from .llvm_writer import FLOAT64, INT64, ProgramWriter
+from .loop_codegen import ADVANCE_TYPE, BEGIN_TYPE, FLOAT64_POINTER, INT64_POINTER
+from .machine_code import MachineCode
+from .parameters import ProgramStructure, flat_parameters
+from .step_loop import CompiledStepLoop, cached_step_loop
+
+FIELD_TYPES = {
+    "begin": BEGIN_TYPE.as_pointer(),
+    "advance": ADVANCE_TYPE.as_pointer(),
+    "parameters": FLOAT64_POINTER,
+    "block": FLOAT64_POINTER,
+    "n_done": INT64_POINTER,
+    "status": FLOAT64_POINTER,
+    "h": FLOAT64_POINTER,
+    "saved": FLOAT64_POINTER,
+    "newton": ADVANCE_TYPE.args[-1],
+    "sizes": FLOAT64_POINTER,
+    "counts": INT64_POINTER,
+    "increments": FLOAT64_POINTER.as_pointer(),
+    "n_segments": INT64,
+}
+"""Fields of the description of a run: the arguments of ``begin`` and ``advance``, and arrays with an entry for each
+segment of equal steps."""
+
+RUN_SIGNATURE = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)
+"""C signature of ``run(description)``."""
+
+
+class ShortRun:
+    """All steps of a run of one trajectory by one call, which returns whether they were taken.
+
+    Parameters
+    ----------
+    addresses : dict from str to int
+        The fields ``parameters``, ``block``, ``n_done``, ``status``, ``h`` and ``saved`` of :data:`FIELD_TYPES`.
+    segments : sequence of (h, n_steps)
+    increments : sequence of array
+        Increments of noise for each segment.
+    """
+
+    def __init__(
+        self, addresses: dict[str, int], segments: Sequence[tuple[float, int]], increments: Sequence[np.ndarray]
+    ):
+        sizes, counts = np.array([h for h, _ in segments]), np.array([n_steps for _, n_steps in segments])
+        pointers = np.array([array.ctypes.data for array in increments])
+        self._arrays = sizes, counts, increments, pointers
+        arrays = {"sizes": sizes, "counts": counts, "increments": pointers}
+        self._fields = np.zeros(len(FIELD_TYPES), dtype=np.int64)
+        known = addresses | {name: array.ctypes.data for name, array in arrays.items()} | {"n_segments": len(sizes)}
+        for name, value in known.items():
+            self._fields[list(FIELD_TYPES).index(name)] = value
+        self._newton = list(FIELD_TYPES).index("newton")
+        self._functions: tuple[Any, ...] = ()
+        self._address, self._run = self._fields.ctypes.data, RUN_SIGNATURE(_run_code().function_address("run"))
+
+    def __call__(self, functions: tuple[Any, Any], newton_address: int) -> bool:
+        """Take all steps by ``begin`` and ``advance``; return False if one fails or needs Newton's method."""
+        if functions != self._functions:
+            self._functions = functions
+            self._fields[:2] = [ctypes.cast(function, ctypes.c_void_p).value or 0 for function in functions]
+        if newton_address:
+            self._fields[self._newton] = newton_address
+        return not self._run(self._address)
+
+
+@functools.cache
+def _run_code() -> MachineCode:
+    """Compile ``run(description)``, which returns 1 if a step fails or needs Newton's method, and otherwise 0."""
+    module = ir.Module("run")
+    description = ir.LiteralStructType(FIELD_TYPES.values()).as_pointer()
+    function = ir.Function(module, ir.FunctionType(INT64, [description]), "run")
+    writer = ProgramWriter(ir.IRBuilder(function.append_basic_block("entry")), 1)
+    build, int32, one = writer.builder, ir.IntType(32), writer.int64(1)
+    field = {name: build.load(build.gep(function.args[0], [int32(0), int32(i)])) for i, name in enumerate(FIELD_TYPES)}
+    build.store(FLOAT64(0.0), field["status"])
+    build.call(field["begin"], [field["parameters"], field["block"], one])
+    with writer.loop_range(field["n_segments"]) as i:
+        size, count, increments = (
+            build.load(build.gep(field[name], [i])) for name in ("sizes", "counts", "increments")
+        )
+        build.store(size, field["h"])
+        build.store(writer.int64(0), field["n_done"])
+        state = field["parameters"], field["block"], field["n_done"]
+        n_saves = build.call(
+            field["advance"], [*state, one, one, count, field["saved"], count, increments, field["newton"]]
+        )
+        has_failed = build.fcmp_unordered("!=", build.load(field["status"]), FLOAT64(0.0))
+        with build.if_then(build.or_(build.icmp_signed("<", n_saves, one), has_failed)):
+            build.ret(one)
+    build.ret(writer.int64(0))
+    return MachineCode(module)
+
+
+class CompiledEngine:
+    """Compiled engine for one system and method; its steps are those of the array engine.
+
+    Raises
+    ------
+    UnsupportedPrimitive
+        If the system or the method uses a primitive that cannot be unrolled; if only Newton's method does, at the first
+        step that needs it.
+    """
+
+    name = "compiled"
+
+    def __init__(
+        self, system: System, method: OneStepMethod, options: SolverOptions = DEFAULT_OPTIONS, planned_steps: int = 0
+    ):
+        self._parameters, self._planned_steps = flat_parameters(system, method), planned_steps
+        self.max_saves_per_call = max_saves_per_call(system)
+        self._structure, self._method, self._options = ProgramStructure.from_module(system), method, options
+
+    @functools.cached_property
+    def _step_loop(self) -> CompiledStepLoop:
+        """Loop of fixed steps, compiled at its first use: an adaptive run has a loop of its own."""
+        return cached_step_loop(self._structure, self._parameters, self._method, options=self._options)
+
+    def adaptive_step_loop(self, control: StepControl) -> tuple[CompiledStepLoop, np.ndarray]:
+        """Return the step loop of an adaptive run, and its parameters."""
+        parameters = np.append(self._parameters, flat_parameters(control))
+        return cached_step_loop(self._structure, parameters, self._method, control, options=self._options), parameters
+
+    @property
+    def n_operations(self) -> int:
+        """Number of scalar operations of a step."""
+        return self._step_loop.n_operations
+
+    @functools.cached_property
+    def trajectory(self) -> CompiledTrajectory:
+        """The trajectory of the runs of this engine, in buffers that every run uses again."""
+        return self.new_trajectory()
+
+    def new_trajectory(self) -> CompiledTrajectory:
+        """Return a trajectory in buffers of its own."""
+        return CompiledTrajectory(self._step_loop, self._parameters)
+
+    def start(self, x) -> CompiledTrajectory:
+        """Return a trajectory that starts at x; it is written over the one that was started before."""
+        self.trajectory.start(x, self._planned_steps)
+        return self.trajectory
+
+    def initial_run_state(self, x) -> State:
+        return self._state_from_block(
+            self._step_loop.start_blocks(self._parameters, np.asarray(x, dtype=np.float64)[None], self._planned_steps)
+        )
+
+    def advance(self, state: State, h, saves: int, save_every: int, noise=None):
+        new_state, out = self._run(state, h, saves, save_every, noise)
+        is_reached = np.arange(saves) < (int(new_state.step) - int(state.step)) // save_every
+        return new_state, (out[:, :-2], out[:, -2], out[:, -1], is_reached)
+
+    def step(self, state: State, h, noise=None) -> State:
+        return self._run(state, h, 1, 1, noise)[0]
+
+    def step_ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
+        blocks = self._step_loop.start_blocks(self._parameters, x)
+        self._step_loop.advance_blocks(self._parameters, blocks, h, 1, 1)
+        fields = self._step_loop.read_fields(blocks, ("x", "status"))
+        return np.where(fields["status"].reshape(-1, 1) == 0.0, fields["x"], np.nan)
+
+    def _run(self, state: State, h, saves: int, save_every: int, noise) -> tuple[State, np.ndarray]:
+        blocks = self._step_loop.block_from_state(state)
+        out = self._step_loop.advance_blocks(
+            self._parameters, blocks, h, saves, save_every, None if noise is None else noise[None]
+        )[0]
+        return self._state_from_block(blocks), out
+
+    def _state_from_block(self, blocks: np.ndarray) -> State:
+        return self._step_loop.state_from_block(blocks)
+
+
+class CompiledTrajectory:
+    """One trajectory in a compiled loop of steps, in buffers that are allocated once.
+
+    The buffers are written in place by the machine code, so each thread needs a trajectory of its own.
+
+    Parameters
+    ----------
+    step_loop : CompiledStepLoop
+        A loop of one lane, with steps of given sizes.
+    parameters : array, shape (p,)
+        Parameters of the system and the method, one after another.
+
+    Attributes
+    ----------
+    parameters : array, shape (p,)
+        A copy, which may change in place before a start; which parameters are zero may not.
+    """
+
+    def __init__(self, step_loop: CompiledStepLoop, parameters: np.ndarray):
+        self._loop, self.parameters = step_loop, np.array(parameters, dtype=np.float64)
+        self._block = step_loop.make_blocks({"x": np.zeros((1, *step_loop.field_shape("x")))})
+        self._row = rows = step_loop.block_rows(self._block)[0, :, 0]
+        self._x, self._status, self._step, self._h = (
+            rows[step_loop.row_slice(name)] for name in ("x", "status", "step", "h")
+        )
+        self._n_saved_values, self._n_done = step_loop.n_saved_values, np.zeros(1, dtype=np.int64)
+        self._addresses = [array.ctypes.data for array in (self.parameters, self._block, self._n_done)]
+
+    def start(self, x, planned_steps: int = 0) -> None:
+        """Start a trajectory at x, shape (n,); ``planned_steps`` decides on optimisation."""
+        begin, _ = self._loop.loop_functions(0, planned_steps)
+        self._status[0], self._x[:] = 0.0, x
+        begin(self._addresses[0], self._addresses[1], 1)
+
+    def advance(self, h: float, n_saves: int, steps_per_save: int, noise: np.ndarray | None = None) -> SavedStates:
+        """Take ``n_saves * steps_per_save`` steps of size h, fewer if one fails, and return the saved states.
+
+        Raises
+        ------
+        UnsupportedPrimitive
+            If a step needs Newton's method, which cannot be compiled; the trajectory is then as it was before.
+        """
+        first_step, block = self._step[0], self._block.copy()
+        out = np.empty((n_saves, self._n_saved_values))
+        try:
+            self._take_steps(h, n_saves, steps_per_save, noise, out)
+        except BaseException:  # an interrupt too: what is not saved was not taken
+            self._block[:] = block
+            raise
+        n_reached = int(self._step[0] - first_step) // steps_per_save
+        return SavedStates(out[:n_reached, :-2], out[:n_reached, -2:])
+
+    def final_state_function(self, segments: Sequence[tuple[float, int]]) -> Callable[[np.ndarray], np.ndarray | None]:
+        """Return the function from an initial state to the final state, shape (n,), with little work besides the steps.
+
+        Its result is None if a step fails, or needs Newton's method for the first time. A call overwrites this
+        trajectory.
+
+        Parameters
+        ----------
+        segments : sequence of (h, n_steps)
+            Step sizes, and how many steps of each size follow one another.
+        """
+        saved, segments = np.empty(self._n_saved_values), tuple(segments)
+        n_total, loop = sum(n_steps for _, n_steps in segments), self._loop
+        increments = [loop.noise_by_lane_block(None, 1, n_steps) for _, n_steps in segments]
+        addresses = dict(zip(("parameters", "block", "n_done"), self._addresses, strict=True))
+        fields = {"status": self._status, "h": self._h, "saved": saved}
+        addresses |= {name: field.ctypes.data for name, field in fields.items()}
+        take_steps, x_row = ShortRun(addresses, segments, increments), self._x
+
+        def final_state(x: np.ndarray) -> np.ndarray | None:
+            x_row[:] = x
+            return x_row.copy() if take_steps(loop.loop_functions(n_total), loop.newton_address(False)) else None
+
+        final_state.buffer = saved  # type: ignore[attr-defined]  # whose address the run has
+        return final_state
+
+    def read(self, name: str) -> float:
+        """Return a scalar field of the state reached so far."""
+        return float(self._row[self._loop.row_slice(name).start])
+
+    @property
+    def state(self) -> State:
+        """The state reached so far, as a copy."""
+        return self._loop.state_from_block(self._block.copy())
+
+    def _take_steps(self, h: float, n_saves: int, steps_per_save: int, noise: np.ndarray | None, out) -> None:
+        n_steps = n_saves * steps_per_save
+        increments = self._loop.noise_by_lane_block(None if noise is None else noise[None], 1, n_steps)
+        parameters, block, n_done = self._addresses
+        self._h[0], self._n_done[0] = h, 0
+        _, advance = self._loop.loop_functions(n_steps)
+        newton, out_address, noise_address = self._loop.newton_address(False), out.ctypes.data, increments.ctypes.data
+        while (
+            advance(parameters, block, n_done, 1, n_saves, steps_per_save, out_address, n_steps, noise_address, newton)
+            < 1
+        ):
+            newton = self._loop.newton_address(True)
+
+
+class CompiledBatch:
+    """Trajectories in lanes with steps of given sizes, the counterpart of :class:`..array_engine.ArrayBatch`.
+
+    Parameters
+    ----------
+    step_loop : CompiledStepLoop
+    first_parameters : array, shape (p,)
+        Parameters of one trajectory: of its system and the method.
+    parameters : array, shape (p,) or (trajectories, p)
+    x : array, shape (trajectories, n)
+    """
+
+    def __init__(self, step_loop: CompiledStepLoop, first_parameters, parameters, x: np.ndarray):
+        self._loop, self._first_parameters, self._n_trajectories = step_loop, first_parameters, len(x)
+        self._blocks = step_loop.start_blocks(parameters, x)
+
+    def advance(self, h, n_saves: int, steps_per_save: int, noise=None) -> np.ndarray:
+        """Take ``n_saves * steps_per_save`` steps; return states, energies and entropies, shape (B, n_saves, n + 2)."""
+        sizes = np.resize(h, len(self._blocks) * self._loop.lanes) if np.ndim(h) else h
+        saved = self._loop.advance_blocks(self._first_parameters, self._blocks, sizes, n_saves, steps_per_save, noise)
+        return np.asarray(saved)[: self._n_trajectories]
+
+    def read(self, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """Return copies of fields of the trajectories by name, by default of all fields."""
+        fields = self._loop.read_fields(self._blocks, names)
+        return {name: values[: self._n_trajectories].copy("K") for name, values in fields.items()}
+
+
+class CompiledAdaptiveRuns:
+    """Adaptive runs of trajectories in lanes, the counterpart of :class:`..adaptive_runs.ArrayAdaptiveRuns`.
+
+    Parameters
+    ----------
+    step_loop : CompiledStepLoop
+    first_parameters : array, shape (p,)
+        Parameters of one trajectory: of its system, the method and the step control.
+    parameters : array, shape (p,) or (trajectories, p)
+    x : array, shape (trajectories, n)
+    t, stop_time, span_length : float
+        See :func:`..adaptive_steps.initial_adaptive_state`.
+    """
+
+    def __init__(
+        self, step_loop: CompiledStepLoop, first_parameters, parameters, x: np.ndarray, t, stop_time, span_length
+    ):
+        self.step_loop, self.first_parameters, self.n_trajectories = step_loop, first_parameters, len(x)
+        initial_fields = {
+            name: np.full((len(x), 1), value)
+            for name, value in (("t", t), ("stop_time", stop_time), ("length", span_length))
+        }
+        self.blocks = step_loop.start_blocks(parameters, x, 0, **initial_fields)
+
+    def advance(self, max_attempts: int) -> None:
+        self.step_loop.advance_blocks(self.first_parameters, self.blocks, 0.0, 1, max_attempts)
+
+    def state(self) -> State:
+        return self.step_loop.state_from_block(self.blocks.copy())
+
+    def attempt_and_record(self, max_attempts: int) -> dict[str, np.ndarray]:
+        """Make up to ``max_attempts`` attempts of the only trajectory and return their records: see ATTEMPT_FIELDS."""
+        n_before, out = self.read("n_attempts")[0], np.empty((1, max_attempts, self.step_loop.n_saved_values))
+        try:
+            self.step_loop.advance_blocks(self.first_parameters, self.blocks, 0.0, max_attempts, 1, out=out)
+        except UnsupportedPrimitive:
+            if self.read("n_attempts")[0] == n_before:
+                raise
+        return self.step_loop.saved_fields_of_one(out[0, : int(self.read("n_attempts")[0] - n_before)])
+
+    def read(self, name: str, indices: np.ndarray | slice = slice(None)) -> np.ndarray:
+        if isinstance(indices, slice):
+            return self.step_loop.read_fields(self.blocks, (name,))[name][: self.n_trajectories][indices].copy()
+        values = self._lane_values(indices, name)
+        return values if name == "p" else values.reshape(len(indices), *self.step_loop.field_shape(name))
+
+    def write(self, name: str, indices: np.ndarray, values) -> None:
+        block, lane = np.divmod(indices, self.step_loop.lanes)
+        values = np.reshape(values, (len(indices), -1)) if np.ndim(values) else values
+        self.step_loop.block_rows(self.blocks, name)[block, :, lane] = values
+
+    def _lane_values(self, indices: np.ndarray, name: str | None = None) -> np.ndarray:
+        """Return a field of the chosen trajectories, or all their rows, shape (trajectories, rows)."""
+        block, lane = np.divmod(indices, self.step_loop.lanes)
+        return self.step_loop.block_rows(self.blocks, name)[block, :, lane]
+
+    def keep_only(self, indices: np.ndarray) -> None:
+        """Drop all trajectories except the chosen ones."""
+        self.blocks, self.n_trajectories = self.step_loop.blocks_from_rows(self._lane_values(indices)), len(indices)

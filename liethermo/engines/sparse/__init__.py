@@ -1,1 +1,0 @@
-"""Sparse engine: Newton's method with sparse matrices for large networks."""
