@@ -16,6 +16,7 @@ from .models.joints import Hinge, Slider, Universal
 from .models.tree import Tree
 from .results.files import AttitudeHistory, read_csv, write_csv
 from .results.orientation import (
+    angular_momentum,
     angular_velocity,
     euler_angles,
     joint_rates,
@@ -39,6 +40,7 @@ __all__ = [
     "Slider",
     "Tree",
     "Universal",
+    "angular_momentum",
     "angular_velocity",
     "attitude",
     "damping_time",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,9 +18,7 @@ SPLINE_DEGREE = 5
 """Degree of the splines through the data, whose derivatives are then of order 5."""
 
 
-def parse_trajectories(
-    data: Any, system: System, observation: Observation, parameters: Mapping[str, Any] | None = None
-) -> list[Trajectory]:
+def parse_trajectories(data: Any, system: System, observation: Observation) -> list[Trajectory]:
     """Return the trajectories in the user's data: pairs of times and observations, solutions, or a table with names.
 
     Raises
@@ -30,7 +28,7 @@ def parse_trajectories(
     """
     trajectories = [
         _checked_trajectory(i, t, x, system, observation)
-        for i, (t, x) in enumerate(_time_observation_pairs(data, observation, parameters))
+        for i, (t, x) in enumerate(_time_observation_pairs(data, observation))
     ]
     if not trajectories:
         raise InputError("there are no trajectories in the data")
@@ -55,13 +53,13 @@ def _columns_of_observation(records: Records, observation: Observation) -> list[
     return [Trajectory(t, x.reshape(len(t), *observation.shape)) for t, x in records]
 
 
-def _time_observation_pairs(data: Any, observation: Observation, parameters) -> list[tuple[Any, Any]]:
+def _time_observation_pairs(data: Any, observation: Observation) -> list[tuple[Any, Any]]:
     if is_table(data):
         data = read_data(data, columns=observation.names or None)
     if isinstance(data, Records):
         return list(_columns_of_observation(data, observation))
     if isinstance(data, Solution):
-        return [(data.t, observation.observe_solution(data, parameters))]
+        return [(data.t, observation.observe_solution(data))]
     if isinstance(data, tuple) and len(data) == 2 and _ndim_or_none(data[0]) == 1:
         t, x = data
         return [(t, x) for x in np.asarray(x)] if _ndim_or_none(x) == 2 + len(observation.shape) else [(t, x)]
@@ -70,7 +68,7 @@ def _time_observation_pairs(data: Any, observation: Observation, parameters) -> 
             "data must be a pair (t, x), t of shape (m,), x of shape (m, n) or (trajectories, m, n), a list of such "
             f"pairs, solutions, or a table that lt.learn.read_data reads, got {type(data).__name__}"
         )
-    return [pair for item in data for pair in _time_observation_pairs(item, observation, parameters)]
+    return [pair for item in data for pair in _time_observation_pairs(item, observation)]
 
 
 def _ndim_or_none(values: Any) -> int | None:

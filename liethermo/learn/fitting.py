@@ -131,7 +131,7 @@ def fit(
         or arrays, in the units of the data. It is a function of x, shape (n,), or of x and the attitude, shape (m, m):
         ``lambda x, R: R`` for attitudes. With ``parameters=`` it is a function of (x), (x, parameters) or
         (t, x, parameters), where parameters are a dict of those that are fitted; an argument that is called ``R`` or
-        ``attitude`` is the attitude. Solutions are observed by it.
+        ``attitude`` is the attitude. Solutions are observed by it, if it does not depend on parameters.
 
         If states are not observed in full, the fit finds the initial ones: only the laws determine them. A system
         without networks begins with those that move as the data do. One with networks begins with zeros.
@@ -199,7 +199,7 @@ def fit(
     method = MetriplecticRungeKutta(4) if method is None else method
     n_substeps = 1 if substeps is None else substeps
     run = losses.differentiable_stepper(model, method, n_substeps, observation.group is not None).system
-    trajectories = [trajectory.flat_trajectory for trajectory in parse_trajectories(data, model, observation, values)]
+    trajectories = [trajectory.flat_trajectory for trajectory in parse_trajectories(data, model, observation)]
     data_scale = data_scales(trajectories)
     sigma = checked_noise(noise, data_scale.scale.size)
     noise_is_estimated = noise is None

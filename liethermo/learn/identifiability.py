@@ -211,7 +211,7 @@ def several(
         system, random = build(fit_seed), np.random.default_rng(fit_seed)
         example, values, _ = parameters_to_fit(system, how.get("parameters"), how.get("also"), how.get("positive"))
         observation = make_observation(example, how.get("observed"), how.get("observe"), values)
-        trajectories = parse_trajectories(data, example, observation, values)
+        trajectories = parse_trajectories(data, example, observation)
         sigma = (
             _noise_std(trajectories, how.get("noise"))
             if resample and len(trajectories) < MIN_BOOTSTRAP_TRAJECTORIES

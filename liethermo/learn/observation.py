@@ -64,6 +64,8 @@ class Observation(NamedTuple):
         True if the whole state is observed, in the form of the system.
     names : tuple of str
         Names of the observed numbers; empty if they have none.
+    needs_parameters : bool
+        True if the function depends on the parameters of the fit.
     """
 
     function: Callable
@@ -72,6 +74,7 @@ class Observation(NamedTuple):
     group: mf.MatrixGroup | None
     is_full_state: bool
     names: tuple[str, ...] = ()
+    needs_parameters: bool = False
 
     def observe(self, prepared_system: System, state, t, parameters) -> jax.Array:
         """Return the observation of a state of a run at a time, as a flat array."""
@@ -91,20 +94,25 @@ class Observation(NamedTuple):
     def zero_observations(self) -> np.ndarray:
         return np.zeros((1, int(np.prod(self.shape))))
 
-    def observe_solution(self, solution: Solution, parameters) -> jax.Array:
+    def observe_solution(self, solution: Solution) -> jax.Array:
         """Return the observations along a solution, shape (m, ...).
 
         Raises
         ------
         InputError
-            If attitudes are observed and the solution has none.
+            If attitudes are observed and the solution has none, or the observation depends on unknown parameters.
         """
+        if self.needs_parameters:
+            raise InputError(
+                "observe depends on the parameters of the fit, so a solution cannot be observed before they are known. "
+                "Give the observations as a pair (solution.t, values), or a function observe of x alone"
+            )
         x, t = jnp.asarray(solution.x), jnp.asarray(solution.t)
         if self.group is None:
-            return jax.vmap(lambda x, t: self.function(x, None, t, parameters))(x, t)
+            return jax.vmap(lambda x, t: self.function(x, None, t, None))(x, t)
         if solution.attitude is None:
             raise InputError("observe needs an attitude, and a solution in the data has none")
-        return jax.vmap(lambda x, R, t: self.function(x, R, t, parameters))(x, jnp.asarray(solution.attitude), t)
+        return jax.vmap(lambda x, R, t: self.function(x, R, t, None))(x, jnp.asarray(solution.attitude), t)
 
     def displace(self, prepared_system: System, state, z) -> jax.Array:
         """Return the state displaced by coordinates z: ``x + z``, and ``g exp(hat(z))`` with the remaining
@@ -178,7 +186,9 @@ def make_observation(
         raise FunctionError(trace_error_message(description, error)) from error
     if not jnp.issubdtype(output_shape.dtype, jnp.floating):
         raise FunctionError(f"observe must return real numbers, not {output_shape.dtype}")
-    return Observation(function, output_shape.shape, np.zeros(0, int), group, False, tuple(names))
+    return Observation(
+        function, output_shape.shape, np.zeros(0, int), group, False, tuple(names), "parameters" in kinds
+    )
 
 
 ATTITUDE_NAMES = ("R", "attitude")

@@ -130,8 +130,8 @@ def principal_axes(inertia) -> PrincipalAxes:
 
     Parameters
     ----------
-    inertia : array, shape (..., 3, 3) symmetric, positive definite
-        Tensors of inertia in body axes (mass * length**2).
+    inertia : array, shape (..., 3, 3) symmetric, positive definite; or three positive numbers
+        Tensors of inertia in body axes (mass * length**2), or the moments about these axes.
 
     Returns
     -------
@@ -154,8 +154,9 @@ def principal_axes(inertia) -> PrincipalAxes:
     (True, True)
     """
     tensors = np.asarray(checked_numbers(inertia, "inertia"), dtype=np.float64)
+    tensors = np.diag(tensors) if tensors.shape == (3,) else tensors
     if tensors.shape[-2:] != (3, 3):
-        raise InputError(f"inertia must have shape (..., 3, 3), got {tensors.shape}")
+        raise InputError(f"inertia must have shape (3,) or (..., 3, 3), got {tensors.shape}")
     moments, axes = np.linalg.eigh(checked_inertia_tensors(tensors))
     warn_of_impossible_moments(moments)
     leading_entries = np.take_along_axis(axes, np.argmax(np.abs(axes) > 1e-8, axis=-2)[..., None, :], axis=-2)

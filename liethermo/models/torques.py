@@ -368,7 +368,7 @@ class Thrusters(Module):
                 f"positions and forces must have shape (k, 3), got {self.positions.shape} and {self.forces.shape}"
             )
         levels = jnp.ones(n) if levels is None else levels
-        self.levels = levels if callable(levels) else checked_finite(jnp.atleast_1d(levels), "levels", n)
+        self.levels = levels if callable(levels) else checked_finite(jnp.atleast_1d(jnp.asarray(levels)), "levels", n)
 
     def __call__(self, t, mu):
         moments = jnp.cross(self.positions, self.forces)
@@ -391,7 +391,7 @@ class Motor(Module):
     moment: jax.Array | Callable
 
     def __init__(self, moment):
-        self.moment = moment if callable(moment) else checked_finite(np.atleast_1d(moment), "moment")
+        self.moment = moment if callable(moment) else jnp.atleast_1d(checked_finite(moment, "moment"))
 
     def __call__(self, t, mu):
         moment = jnp.atleast_1d(self.moment(t) if callable(self.moment) else self.moment)

@@ -140,12 +140,8 @@ def angular_velocity(
     InputError
         If the system has no rigid body, no states were kept, or the frame is "space" without attitudes.
     """
-    if frame not in ("body", "space"):
-        raise InputError(f"frame must be 'body' or 'space', got {frame!r}")
     absence = "no angular velocity: its system contains no rigid body on so(3) or se(3)"
-    omega = _velocities_of(solution, "angular_velocity", absence)
-    if frame == "space":
-        omega = np.einsum("...ij,...j->...i", _attitudes(solution), omega)
+    omega = _vectors_in_frame(solution, _velocities_of(solution, "angular_velocity", absence), frame)
     return np.rad2deg(omega) if degrees else omega
 
 
@@ -231,7 +227,47 @@ def joint_rates(solution: AuditableResult) -> dict[str, np.ndarray]:
     return solution.split_by_joint(rates, first)
 
 
-def nutation(solution: AuditableResult, axis=None) -> np.ndarray:
+def angular_momentum(solution: AuditableResult, frame: Literal["body", "space"] = "body") -> np.ndarray:
+    """Return the angular momentum of a body with all that it carries, whose state begins with it.
+
+    In space it is constant, unless a torque acts from outside.
+
+    Parameters
+    ----------
+    solution : Solution, or Ensemble
+        A result of a body whose state begins with its angular momentum in body axes.
+    frame : {"body", "space"}
+        Axes of the components: axes of the body, or axes fixed in space, which need attitudes.
+
+    Returns
+    -------
+    ndarray, shape (times, 3), or (B, times, 3) of an ensemble of trajectories, (B, 3) of one of final states
+        Momenta (mass * length**2 / time).
+
+    Raises
+    ------
+    InputError
+        If there is no momentum, or the frame is "space" without attitudes.
+
+    Examples
+    --------
+    >>> body = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.5)
+    >>> run = lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 10.0), 0.1)
+    >>> momentum = lt.bodies.angular_momentum(run, frame="space")
+    >>> np.allclose(momentum, momentum[0], atol=1e-14)
+    True
+    """
+    return _vectors_in_frame(solution, _momenta(solution), frame)
+
+
+def _vectors_in_frame(solution: AuditableResult, vectors: np.ndarray, frame: str) -> np.ndarray:
+    """Return vectors in body axes, shape (..., 3), in axes of the body or fixed in space."""
+    if frame not in ("body", "space"):
+        raise InputError(f"frame must be 'body' or 'space', got {frame!r}")
+    return vectors if frame == "body" else np.einsum("...ij,...j->...i", _attitudes(solution), vectors)
+
+
+def nutation(solution: AuditableResult, axis=None, degrees: bool = False) -> np.ndarray:
     """Return the angle between a body axis e and the angular momentum, ``arctan2(|e × mu|, e . mu)``, 0 to pi.
 
     A torque-free body with friction ends at 0, or at pi if it spins about the other end of the axis.
@@ -243,11 +279,13 @@ def nutation(solution: AuditableResult, axis=None) -> np.ndarray:
     axis : array, shape (3,), optional
         The axis in body axes, of any length. The default is the axis of greatest inertia, or of least inertia if the
         two greatest are equal, as for a rod; its first nonzero component is positive.
+    degrees : bool
+        If true, the unit is degrees instead of rad.
 
     Returns
     -------
     ndarray, shape (times,), or (B, times) of an ensemble of trajectories, (B,) of one of final states
-        Angles (rad).
+        Angles.
 
     Raises
     ------
@@ -263,7 +301,8 @@ def nutation(solution: AuditableResult, axis=None) -> np.ndarray:
     (True, True)
     """
     mu, (a, b, e) = _momenta(solution), _body_frame(solution, axis)
-    return np.arctan2(np.hypot(mu @ a, mu @ b), mu @ e)
+    angles = np.arctan2(np.hypot(mu @ a, mu @ b), mu @ e)
+    return np.rad2deg(angles) if degrees else angles
 
 
 def spin(solution: AuditableResult, axis=None) -> np.ndarray:

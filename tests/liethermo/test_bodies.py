@@ -250,7 +250,7 @@ def test_no_tensor_of_a_rigid_body_is_ever_three_bodies(masses, seed):
         (lambda I: lt.bodies.periods(I([[2, -3, 0], [-3, 2, 0], [0, 0, 2]]), 1.0, 1.0), "positive definite, got"),
         (lambda I: lt.bodies.periods(I([[2, 0, 0], [0.1, 2, 0], [0, 0, 2]]), 1.0, 1.0), "positive and finite"),
         (lambda I: jax.jit(lambda i: lt.bodies.rate_of(1.0, i, 1.0))(I(TENSOR)), "use jax.vmap for many"),
-        (lambda I: lt.bodies.principal_axes(I([2.0, 2.5, 3.0])), r"must have shape \(\.\.\., 3, 3\), got \(3,\)"),
+        (lambda I: lt.bodies.principal_axes(I([2.0, 2.5])), r"must have shape \(3,\) or \(\.\.\., 3, 3\), got \(2,\)"),
         (lambda I: lt.models.body_with_wheels(I(np.ones((2, 3)))), r"got \(2, 3\)"),
         (lambda I: body_with_wheels_rest(1.0, 1.0, I([1.0, 2.0])), r"got \(2,\)"),
         (lambda I: lt.models.rigid_body(I([[2, 0, 0], [0.1, 2, 0], [0, 0, 2]])), "must be symmetric"),

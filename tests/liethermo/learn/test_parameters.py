@@ -288,6 +288,21 @@ def test_an_observation_may_depend_on_the_attitude_and_a_parameter():
     np.testing.assert_allclose(fitted_system.training.values, [2.0, 2.5, 0.7], rtol=1e-3)
 
 
+def test_a_solution_is_not_observed_with_the_guess_of_the_parameters():
+    """By the guess, the angular velocity of a run would be a wrong one; as numbers it determines the inertias."""
+    inertia, scale = np.array([0.3, 1.0, 1.2]), lambda p: jnp.stack([p["a"], 1.0, p["c"]])
+    run = lt.integrate(
+        lt.models.free_rigid_body(inertia), inertia * [0.3, 8.0, 0.2], (0.0, 2.0), 0.02, lt.MetriplecticGauss(3)
+    )
+    body = lambda p: lt.models.free_rigid_body((p["a"], 1.0, p["c"]))  # noqa: E731
+    how = {"parameters": {"a": 0.5, "c": 1.3}, "positive": True}
+    for data in (run, [run, run]):
+        with pytest.raises(lt.InputError, match="cannot be observed before they are known"):
+            lt.learn.fit(body, data, observe=lambda x, p: x / scale(p), **how)
+    fitted_system = lt.learn.fit(body, (run.t, run.x / inertia), observe=lambda x, p: x / scale(p), **how)
+    np.testing.assert_allclose(fitted_system.training.values, [0.3, 1.2], rtol=1e-6)
+
+
 BAD = {
     "no parameters": (lambda: lt.learn.fit(spring, (TIMES, spring_record())), "needs parameters="),
     "no dict": (

@@ -116,3 +116,12 @@ def test_a_rod_is_allowed_only_where_its_axis_plays_no_part():
             BUILDERS[name](np.array([0.0, 2.0, 2.0]))
     with pytest.raises(lt.InputError, match="positive"):
         lt.models.free_rigid_body([0.0, 1.0, 2.0])  # a lamina in its axis is no rod
+
+
+def test_principal_axes_of_moments_are_those_of_their_diagonal_tensor():
+    for part, expected in zip(
+        lt.bodies.principal_axes([3.0, 2.0, 4.0]), lt.bodies.principal_axes(np.diag([3.0, 2.0, 4.0])), strict=True
+    ):
+        np.testing.assert_array_equal(part, expected)
+    with pytest.raises(lt.InputError, match=r"\(3,\) or"):
+        lt.bodies.principal_axes([3.0, 2.0])

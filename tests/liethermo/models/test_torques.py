@@ -404,3 +404,11 @@ def test_torque_of_the_time_alone():
         np.testing.assert_allclose(runs[0].x, runs[1].x, atol=1e-15)
         assert runs[0].audit().passed
         assert np.ptp(runs[0].x @ np.eye(3)[1]) > 1e-3
+
+
+def test_levels_of_thrusters_may_be_a_list():
+    as_list, as_array = (
+        T.Thrusters(np.eye(3), np.ones((3, 3)), levels) for levels in ([0.1, 0.0, 0.3], np.array([0.1, 0.0, 0.3]))
+    )
+    np.testing.assert_array_equal(as_list(0.0, jnp.zeros(3)), as_array(0.0, jnp.zeros(3)))
+    assert np.abs(as_list(0.0, jnp.zeros(3))).max() > 0.1

@@ -260,3 +260,23 @@ def test_a_run_refers_quaternions_and_angles_to_the_function_that_converts_them(
     body = lt.models.free_rigid_body(attitude=True)
     with pytest.raises(lt.InputError, match=r"lt\.bodies\.attitude\(quaternion=\.\.\.\)"):
         lt.integrate(body, [0.1, 0.2, 1.0], (0.0, 1.0), 0.1, attitude=attitude)
+
+
+def test_angular_momentum_in_both_frames_of_a_run_and_an_ensemble():
+    body = lt.models.reaction_wheels((3.0, 2.0, 1.5), friction=0.1)
+    x0 = body.state(angular_velocity=(0.1, 0.2, 0.5), rotor_rates=(3.0, 0.0, -1.0))
+    g0 = Rotation.from_euler("zyx", [0.4, 0.2, -0.3])
+    span, method = (0.0, 2.0), lt.MetriplecticGauss(2)
+    run = lt.integrate(body, x0, span, 0.1, method, attitude=g0)
+    expected = np.array([3.0, 2.0, 1.5]) * [0.1, 0.2, 0.5] + 0.1 * np.array([3.0, 0.0, -1.0])
+    assert np.allclose(lt.bodies.angular_momentum(run)[0], expected, atol=1e-15)
+    assert np.allclose(lt.bodies.angular_momentum(run, frame="space"), g0.apply(expected), atol=1e-13)
+    many = lt.ensemble(body, np.stack([x0, 2 * x0]), span, 0.1, method, attitude=g0)
+    assert np.allclose(lt.bodies.angular_momentum(many, "space"), np.outer([1, 2], g0.apply(expected)), atol=1e-13)
+    assert np.allclose(np.radians(lt.bodies.nutation(run, degrees=True)), lt.bodies.nutation(run), atol=1e-15)
+    with pytest.raises(lt.InputError, match="frame must be"):
+        lt.bodies.angular_momentum(run, frame="inertial")
+    wheels = lt.models.body_with_wheels()
+    closed = lt.integrate(wheels, wheels.state(angular_velocity=(0.1, 0.2, 0.3)), (0.0, 0.1), 0.1)
+    with pytest.raises(lt.InputError, match="angular momentum"):
+        lt.bodies.angular_momentum(closed)  # its state begins with the angular velocity
