@@ -92,15 +92,17 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         z, dH, dS, dL = self.method.midpoint_and_gradients(system, x, compensation, h, k)
         factors_and_inputs = self._factors_and_inputs(system, z, dH, dL, h)
-        field, noise = system.field(z, dH, dS, dL), [B.times(w) for B, w in factors_and_inputs]
-        rotations = [
+        turns = [
             B.spin_coefficients[..., None] * w.reshape(-1, 3)
             for B, w in factors_and_inputs
             if B.spin_coefficients is not None
         ]
-        # Solve for the turn of each spin at once: among many spins some turn far, and the iteration would be slow.
-        change = system.solve_at_spins(z, dH, sum(rotations), 0.5 * h, [field, *noise, -k[0]]) if rotations else None
-        return (sum(noise, field) if change is None else k[0] + change)[None]
+        if turns:
+            others = sum((B.times(w) for B, w in factors_and_inputs if B.spin_coefficients is None), jnp.zeros_like(z))
+            slopes = system.solve_at_spins(z, dH, dS, sum(turns[1:], turns[0]), others, 0.5 * h, k[0])
+            if slopes is not None:
+                return slopes[None]
+        return sum((B.times(w) for B, w in factors_and_inputs), system.field(z, dH, dS, dL))[None]
 
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
         z, dH, dS, dL = self.method.midpoint_and_gradients(system, x, compensation, h, k)

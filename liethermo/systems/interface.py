@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, Self
@@ -281,19 +281,24 @@ class SystemInterface(Geometry):
 
     # -- spins ----------------------------------------------------------------------------------------------------
 
-    def solve_at_spins(self, x, dH, noise_rates, half_step, velocities: Sequence) -> jax.Array | None:
-        """Return u with ``u_i - half_step J_i u_i = v_i`` at each spin, and ``u = v`` elsewhere; None without spins.
+    def solve_at_spins(self, x, dH, dS, noise_rates, others, half_step, k) -> jax.Array | None:
+        """Return the slopes of a step from earlier slopes k, solved at each spin in its present field; None without
+        spins.
 
-        J_i is the derivative by s_i, at the given gradient dH, of the velocity of spin i.
+        A solution of ``k = v`` is kept, where v is the field plus the turn by noise plus ``others``. Each spin gets
+        ``k_i + u_i`` with ``u_i - half_step J_i u_i = v_i - k_i``, J_i the derivative of v_i by s_i at the given
+        gradient dH, and the other components get v.
 
         Parameters
         ----------
-        x, dH : array, shape (n,)
+        x, dH, dS : array, shape (n,)
+            Midpoint of the step and gradients there.
         noise_rates : array, shape (sites, 3) or (1, 3)
             Angular velocities by noise (1 / time).
+        others : array, shape (n,)
+            Velocity by other noise.
         half_step : array, shape ()
-        velocities : sequence of arrays, shape (n,)
-            Summands of v.
+        k : array, shape (n,)
         """
         return None
 
