@@ -25,7 +25,7 @@ from ..errors import InputError
 from ..functions.checks import traced_function_and_shape
 from ..functions.energy import Energy
 from ..functions.magnetism.spin_energy import lattice_shape
-from ..functions.magnetism.spin_torques import check_spin_torque
+from ..functions.magnetism.spin_torques import checked_spin_torque
 from ..functions.on_spaces import (
     HalfSumOfSquares,
     Spheres,
@@ -111,7 +111,7 @@ class SpinSystem(TorqueSystem):
         power=None,
     ):
         self.lattice = lattice_shape(sites)
-        self.torque = None if torque is None else check_spin_torque(torque, self.lattice)
+        self.torque = None if torque is None else checked_spin_torque(torque, self.lattice)
         self.torque_arguments = None
         self.powered_baths, self.power = _checked_powers(power, baths)
         poisson = mf.Spins(self.lattice, ratio=ratio)

@@ -138,7 +138,7 @@ def _amplitude(value, t) -> jax.Array:
     return amplitude[..., None] if amplitude.ndim else amplitude
 
 
-def check_spin_torque(torque, sites: tuple[int, ...]) -> tuple[Callable, ...]:
+def checked_spin_torque(torque, sites: tuple[int, ...]) -> tuple[Callable, ...]:
     """Return a checked tuple of functions w(t, s) of torques ``s x w``.
 
     Raises
