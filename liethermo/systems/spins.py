@@ -175,8 +175,9 @@ class SpinSystem(TorqueSystem):
     def solve_at_spins(self, x, dH, dS, noise_rates, others, half_step, k) -> jax.Array | None:
         """Return the slopes of a step from earlier slopes k, solved at each spin in its present field.
 
-        Noise, precession and damping turn s at the angular velocity ``w - gamma dH - lambda s x dH``, and damping has
-        the factor ``lambda s . dH`` besides. So ``c u - a x u = r`` with the angle a in half a step, which has the
+        Noise, precession and damping turn s at the angular velocity ``w - gamma dH - lambda s x dH``, w in
+        ``noise_rates``, and damping has the factor ``lambda s . dH`` besides. So ``c u - a x u = r`` with the angle a
+        in the time ``half_step``, which has the
         solution ``u = (c r + a x r + (a . r) a / c) / (c^2 + |a|^2)``, as ``c a . u = a . r``.
         """
         spins, parts, n = self._spin_structure, _split_damping(self.total_dissipation), self.body_dim
