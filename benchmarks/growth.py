@@ -11,7 +11,7 @@ import numpy as np
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.systems.invariants import recorded_invariants
+from liethermo.systems.invariants import recorded_functions_with_verdicts
 
 from . import child, laws
 from .contest import RATE_TIMES_DURATION, Engine
@@ -56,7 +56,7 @@ def measure_engines(name: str, steps: int, rounds: int) -> dict:
     g = algebra_by_name(name)
     strength = float(np.trace(-g.killing_form())) / g.dim
     system = generalized_body(g, RATE_TIMES_DURATION / (STEP * steps * strength))
-    recorded_invariants(system)  # Casimirs are found once for an algebra, by either engine
+    recorded_functions_with_verdicts(system)  # Casimirs are found once for an algebra, by either engine
     x0 = random_states(1, g.dim)[0]
 
     def run(engine: Engine, count: int) -> lt.Solution:

@@ -115,7 +115,7 @@ class AdiabaticJumps(ThermalJumps):
             groups = _distinct_pair_groups(structure.size)
         else:
             hamiltonians = system.hamiltonians()
-            groups = _pair_groups(hamiltonians)
+            groups = _group_numbers_of_level_pairs(hamiltonians)
             self._check_rates_at_zero(hamiltonians)
         return replace_fields(self, pair_groups=Indices(groups))
 
@@ -234,7 +234,7 @@ def _distinct_pair_groups(size: int) -> np.ndarray:
     return groups
 
 
-def _pair_groups(hamiltonians: list[np.ndarray]) -> np.ndarray:
+def _group_numbers_of_level_pairs(hamiltonians: list[np.ndarray]) -> np.ndarray:
     """Return the number of the group of each pair (j, k) of ordered levels, shape (N, N); -1 where ``E_k < E_j``.
 
     Pairs with the same distance under each of the Hamiltonians are in one group. Group 0 has the distance zero.

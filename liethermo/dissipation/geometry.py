@@ -17,6 +17,30 @@ from ..functions.energy import Energy
 from ..tracing.programs import subprogram
 
 
+class HeatingSites:
+    """Sites that may each heat a bath of their own, with products of vectors at each site.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Shape of the lattice of the sites; () if there are none.
+    """
+
+    def __init__(self, shape: tuple[int, ...]):
+        self.shape = shape
+
+    def scale(self, values, v) -> jax.Array:
+        """Return a vector, shape (n,), times one number for each site, shape (sites,), or times a single number."""
+        return values * v if jnp.ndim(values) == 0 else self._scale_each(values, v)
+
+    def _scale_each(self, values, v) -> jax.Array:
+        return (values[:, None] * v.reshape(len(values), -1)).ravel()
+
+    def dot(self, alpha, v) -> jax.Array:
+        """Return ``alpha . v`` at each site, shape (sites,)."""
+        return jnp.sum((alpha * v).reshape(math.prod(self.shape), -1), axis=1)
+
+
 class Geometry(Module):
     """Interface of a system for its dissipation; every system class has it.
 
@@ -59,9 +83,9 @@ class Geometry(Module):
         return (*self.sites, self.dim // math.prod(self.sites))
 
     @property
-    def heating_sites(self) -> tuple[int, ...]:
-        """Shape of the lattice of the sites that may each heat a bath of their own; () if there are none."""
-        return self.sites
+    def heating_sites(self) -> HeatingSites:
+        """The sites that may each heat a bath of their own, with the products of vectors at each of them."""
+        return HeatingSites(self.sites)
 
     @property
     @abstractmethod
@@ -92,16 +116,6 @@ class Geometry(Module):
         if self.space is None:
             return v
         return self.space.to_vector(self.space._metric_covector(self.points(x), self.points(v)).conj())
-
-    def scale_at_sites(self, values, v) -> jax.Array:
-        """Return a vector, shape (n,), times one number for each site, shape (sites,), or times a single number."""
-        if jnp.ndim(values) == 0:
-            return values * v
-        return (values[:, None] * v.reshape(len(values), -1)).ravel()
-
-    def dot_at_sites(self, alpha, v) -> jax.Array:
-        """Return ``alpha . v`` at each site, shape (sites,)."""
-        return jnp.sum((alpha * v).reshape(math.prod(self.sites), -1), axis=1)
 
 
 @subprogram

@@ -72,10 +72,10 @@ class Heating(LiftedDissipation):
         scale = sqrt_or_zero(self.temperature_signs(dH[n:]) * T)
 
         def times(w):
-            return self._append_entropy_rates(body, body.scale_at_sites(scale, B.times(w)), dH, n)
+            return self._append_entropy_rates(body, body.heating_sites.scale(scale, B.times(w)), dH, n)
 
         velocity_map = B.velocity
-        velocity = None if velocity_map is None else lambda w: body.scale_at_sites(scale, velocity_map(w))
+        velocity = None if velocity_map is None else lambda w: body.heating_sites.scale(scale, velocity_map(w))
         spin_coefficients = None if B.spin_coefficients is None else scale * B.spin_coefficients
         return B._replace(times=times, velocity=velocity, spin_coefficients=spin_coefficients, solenoidal=False)
 
@@ -93,7 +93,7 @@ class Heating(LiftedDissipation):
         if slopes is None:
             return body_divergence
         ratio = jnp.where(T > 0.0, 0.5 * self.values_at_sites(slopes) / jnp.where(T > 0.0, T, 1.0) ** 1.5, 0.0)
-        return body_divergence + B.transpose_times(body.scale_at_sites(ratio, dH[:n]))
+        return body_divergence + B.transpose_times(body.heating_sites.scale(ratio, dH[:n]))
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
         return _body_inner_geometry(system, x)
@@ -126,9 +126,8 @@ class Heating(LiftedDissipation):
             self.values_at_sites(dS[body_dim:]),
             self.temperature_signs(dH[body_dim:]),
         )
-        return body.scale_at_sites(
-            sign, body.scale_at_sites(dS_y, dH[:body_dim]) - body.scale_at_sites(T, dS[:body_dim])
-        )
+        scale = body.heating_sites.scale
+        return scale(sign, scale(dS_y, dH[:body_dim]) - scale(T, dS[:body_dim]))
 
     def values_at_sites(self, values) -> jax.Array:
         """Return values of baths, shape (m,), at the sites that heat them, shape () or (sites,)."""
@@ -136,7 +135,7 @@ class Heating(LiftedDissipation):
 
     def _append_entropy_rates(self, body: Geometry, v, dH, body_dim: int) -> jax.Array:
         """Return the velocity v of the body, shape (n,), followed by the entropy rates from the energy it loses."""
-        energy_gain = body.dot_at_sites(dH[:body_dim], v) if self.has_site_baths else jnp.dot(dH[:body_dim], v)
+        energy_gain = body.heating_sites.dot(dH[:body_dim], v) if self.has_site_baths else jnp.dot(dH[:body_dim], v)
         return jnp.concatenate([v, self.entropy_rates(-energy_gain, dH[body_dim:])])
 
 
@@ -193,8 +192,9 @@ def _couple_term_to_baths(
         return HeatlessDissipation(term, functions)
     bath = Indices(0) if term.heated_bath_index is None else term.heated_bath_index
     numbers = np.asarray(bath)
-    if numbers.shape not in ((), body.heating_sites):
-        shape_text = f", or an array of the shape {body.heating_sites} of the sites" if body.heating_sites else ""
+    lattice = body.heating_sites.shape
+    if numbers.shape not in ((), lattice):
+        shape_text = f", or an array of the shape {lattice} of the sites" if lattice else ""
         raise InputError(f"bath must be the number of a bath{shape_text}, got shape {numbers.shape}")
     if not (numbers.min() >= 0 and numbers.max() < n_baths):
         bad_number = int(numbers[(numbers < 0) | (numbers >= n_baths)][0]) if numbers.shape else int(numbers)

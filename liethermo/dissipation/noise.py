@@ -23,7 +23,7 @@ FACTOR_DIVERGENCE_CHECK = "div B = 0, as stated"
 """Row of ``system.check()``: a factor that is declared solenoidal has columns of divergence zero."""
 
 
-def terms_with_factors(
+def noisy_terms_with_factors(
     dissipation: Dissipation, system: Geometry, x, dH, dL: Sequence
 ) -> list[tuple[Dissipation, Factor]]:
     """Return each summand that has noise, with its factor at the given gradients.
@@ -56,7 +56,7 @@ def factor_divergences(dissipation: Dissipation, system: Geometry, x) -> jax.Arr
 def terms_with_factors_at_state(dissipation: Dissipation, system: Geometry, x) -> list[tuple[Dissipation, Factor]]:
     """Return each summand that has noise, with its factor by the exact gradients of all functions at x."""
     dL = [L.gradient(x) for L in dissipation.preserve]
-    return terms_with_factors(dissipation, system, x, system.energy.gradient(x), dL)
+    return noisy_terms_with_factors(dissipation, system, x, system.energy.gradient(x), dL)
 
 
 def factor_check_residuals(dissipation: Dissipation, system: Geometry, x) -> dict[str, jax.Array]:

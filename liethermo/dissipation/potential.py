@@ -97,7 +97,7 @@ class DissipationPotential(Dissipation):
         return lambda f: jnp.asarray(self.psi(x, f) if self.depends_on_state else self.psi(f))
 
     def input_residuals(self, system, x):
-        """Return the decrease of the slope between two forces, and the slope at zero force, both relative, by name."""
+        """Return relative residuals of two conditions on the potential: it is convex, and least at zero force."""
         slope = jax.grad(self.psi_at_state(x))
         size = self._base_factor_at_state(system, x).size
         pairs = np.random.default_rng(0).standard_normal((CONVEXITY_PAIRS, 2, size))

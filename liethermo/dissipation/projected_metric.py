@@ -112,7 +112,7 @@ class ProjectedMetric(Dissipation):
         return self.rate * (projection if self.normalized else math.prod(frame.squared_norms) * projection)
 
     def factor(self, system, x, dH, dL):
-        """Return the factor ``P^T L`` with ``L L^T = G``; for the energy alone one column for each pair i < j.
+        """Return a factor ``P^T L`` of the friction matrix, P its projector and ``L L^T = G`` its metric.
 
         The divergence of the latter is zero if G is constant.
         """

@@ -83,7 +83,7 @@ class ArrayAdaptiveRuns:
         """Return the state of the only trajectory."""
         return State(*(self.read(name)[0] for name in State._fields))
 
-    def attempt_and_record(self, max_attempts: int) -> dict[str, np.ndarray]:
+    def record_attempts(self, max_attempts: int) -> dict[str, np.ndarray]:
         """Make one attempt of the only trajectory and return its record, the fields ATTEMPT_FIELDS."""
         del max_attempts  # a single attempt: this engine does not record several at once
         self.advance(1)
@@ -369,7 +369,8 @@ class PauseHandler:
         return [np.array(group) for group in groups.values()]
 
     def resume_paused(self) -> None:
-        """Resume the trajectories at a stop, finish those at their end, and compute missing growth rates."""
+        """Resume trajectories that paused, finish those that have reached their end, and compute missing growth
+        rates."""
         runs, status = self.adaptive_runs, self.adaptive_runs.read("status")
         at_stop = np.flatnonzero(status == StatusCode.PAUSED_AT_STOP)
         if at_stop.size:

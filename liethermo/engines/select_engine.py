@@ -204,7 +204,7 @@ class EngineWithFallback:
                     "as a ComposedSystem of lt.Copies joined by lt.Each"
                 )
         repays_compiling = self.planned_steps >= MIN_STEPS_TO_COMPILE or system.hints.has_matrix_functions
-        if self.requested_engine == "compiled" or (is_auto and is_worth_compiling(system)):
+        if self.requested_engine == "compiled" or (is_auto and is_worth_compiling(system, method)):
             compiled = CompiledEngine(system, method, planned_steps=self.planned_steps)
             try:
                 n_operations = count_operations(compiled)
@@ -266,9 +266,11 @@ class Trajectory:
         return self._trajectory.state
 
 
-def is_worth_compiling(system: System) -> bool:
-    """Return whether compiling a system may pay off: it can be unrolled, has few components, and runs on the CPU."""
-    return system.hints.can_unroll and system.dim <= MAX_COMPILED_DIM and jax.default_backend() == "cpu"
+def is_worth_compiling(system: System, method: OneStepMethod) -> bool:
+    """Return whether compiling a step may pay off: it can be unrolled, has few components, and runs on the CPU."""
+    hints = system.hints
+    can_unroll = hints.can_unroll and (method.explicit or hints.can_unroll_newton)
+    return can_unroll and system.dim <= MAX_COMPILED_DIM and jax.default_backend() == "cpu"
 
 
 def warn_of_fallback(error: UnsupportedPrimitive) -> None:

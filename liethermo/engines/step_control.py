@@ -224,7 +224,7 @@ def next_step_size_and_end(control: StepControl, adaptive_state: AdaptiveState) 
 
 
 def next_full_step_size_and_end(control: StepControl, adaptive_state: AdaptiveState) -> tuple[jax.Array, jax.Array]:
-    """Return the size of the next full step and the time after it; none ends just before a stop time."""
+    """Return the size of the next full step and the time at its end; no step ends just before a stop time."""
     if control.adaptive:
         remaining = adaptive_state.stop_time - adaptive_state.t
         reaches_stop = remaining <= adaptive_state.next_step_size * (1 + 1e-12)

@@ -250,7 +250,8 @@ class MeanEnergy(Linear):
 
 
 def choose_reference_level(levels: np.ndarray) -> float:
-    """Return the lower of the two nearest levels as the zero of energy: their difference then loses no digit.
+    """Return the lower level of the pair with the smallest gap; as the zero of energy it keeps all digits of the
+    gap.
 
     It grows by c if all levels, shape (N,), do.
     """

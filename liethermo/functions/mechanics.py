@@ -255,7 +255,8 @@ def is_mechanical(energy: Energy, dim: int, space: mf.Space | None = None) -> bo
         None if space is None else evaluate_at_points(_tangent_projector_matrix, space, points[:, : space.size])
     )
     return all(
-        _is_kinetic(term, points, projectors) or is_independent_of_momenta(term, points) for term in energy.terms
+        _is_kinetic_with_potential(term, points, projectors) or is_independent_of_momenta(term, points)
+        for term in energy.terms
     )
 
 
@@ -272,7 +273,7 @@ def is_independent_of(term: Energy, points: np.ndarray, components: np.ndarray) 
     return isinstance(term, Pullback) and not evaluate_at_points(_jacobian, term, points)[:, :, components].any()
 
 
-def _is_kinetic(term: Energy, points: np.ndarray, projectors: np.ndarray | None) -> bool:
+def _is_kinetic_with_potential(term: Energy, points: np.ndarray, projectors: np.ndarray | None) -> bool:
     """Return whether a term is a semidefinite form in p plus a function of q and S."""
     n = points.shape[1] // 2
     if isinstance(term, Kinetic):

@@ -31,7 +31,7 @@ def newton_correction(jacobian, residual) -> jax.Array:
 
 
 def newton_iterate(function: Callable, start, n_steps: int, jacobian_and_value: Callable = jacobian_and_value):
-    """Return y after some steps of Newton's method for ``function(y) = 0``, a number or shape (n,); differentiable.
+    """Return y, a number or of shape (n,), after ``n_steps`` steps of Newton's method for ``function(y) = 0``.
 
     Parameters
     ----------

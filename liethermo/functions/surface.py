@@ -127,7 +127,8 @@ class ConstraintSurface:
         return self.space._inside(self._point(x))
 
     def project_state(self, x) -> jax.Array:
-        """Return a state nearer to the surface, for functions that are defined only on the surface."""
+        """Return the state after one step of a projection onto the surface, for functions that are defined only
+        there."""
         return (
             x
             if _constraint_count(self.space) == 0

@@ -28,8 +28,8 @@ BREAK_RTOL = 8.0 * float(np.finfo(np.float64).eps)
 class TimeSpan(Module):
     """The start and end time of a run, infinite until a run sets them: see :func:`set_time_span`.
 
-    The sum of the steps of a run may exceed the end of the span by a rounding: 0.1 + 0.1 + 0.1 > 0.3. A table or a root
-    that ends with the span is not defined there.
+    The sum of the steps of a run may exceed the end of the span by a rounding error: 0.1 + 0.1 + 0.1 > 0.3. A table or
+    a root that ends with the span is not defined there.
 
     Attributes
     ----------
@@ -48,8 +48,8 @@ class TimeSpan(Module):
     def interval_at(self, t) -> TimeSpan:
         """Return the interval between two breaks in which a step lies that starts at time t, shape ().
 
-        The interval ends a rounding before a break, and starts a rounding after one. So a function that jumps at the
-        break has one of its two limits there, whether it is defined with ``t >= time`` or with ``t > time``.
+        The interval ends before a break, and starts after one, by the rounding error of the times. So a function
+        that jumps at the break has one of its two limits there, whether it is defined with ``>=`` or with ``>``.
         """
         tolerance = self._break_tolerance
         is_past = self.breaks <= t + tolerance
@@ -140,7 +140,7 @@ class DeclaredTimes(NamedTuple):
 
     @classmethod
     def from_tree(cls, tree: Any) -> DeclaredTimes:
-        """Return the times that the functions of time in a pytree declare."""
+        """Return the times at which functions of time in a pytree declare to be not smooth."""
         leaves = jax.tree_util.tree_leaves(tree, is_leaf=lambda node: isinstance(node, FunctionWithBreaks))
         functions = [leaf for leaf in leaves if isinstance(leaf, FunctionWithBreaks)]
         jumps, kinks = {t for f in functions for t in f.break_times}, {t for f in functions for t in f.kink_times}
@@ -360,7 +360,7 @@ class Table(FunctionWithBreaks):
             raise InputError(f"kind must be 'linear' or 'cubic', got {kind!r}")
         if callable(times):
             if values is not None:
-                raise InputError("values= belongs to times, but a spline was given, which has values")
+                raise InputError("give values= only with an array of times: a spline has its values")
             self.times, self.coefficients = _pieces_of_spline(times)
             self.values, self.shape = None, self.coefficients.shape[2:]
             return
@@ -383,7 +383,7 @@ class Table(FunctionWithBreaks):
 
     @classmethod
     def from_parts(cls, times, values, coefficients) -> Table:
-        """Return the table with these attributes, which are not checked."""
+        """Return a table of values at times from its attributes, without a check."""
         table = object.__new__(cls)
         shape = values.shape[1:] if coefficients is None else coefficients.shape[2:]
         for name, value in {"times": times, "values": values, "coefficients": coefficients, "shape": shape}.items():

@@ -17,7 +17,7 @@ from ..dissipation.noise import (
     factor_check_residuals,
     factor_divergences,
     generic_covectors,
-    terms_with_factors,
+    noisy_terms_with_factors,
     terms_with_factors_at_state,
 )
 from ..errors import InputError
@@ -91,20 +91,22 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         z, dH, dS, dL = self.method.midpoint_and_gradients(system, x, compensation, h, k)
-        factors_and_inputs = self._factors_and_inputs(system, z, dH, dL, h)
-        field, noise = system.field(z, dH, dS, dL), [B.times(w) for B, w in factors_and_inputs]
-        rotations = [
+        factors_and_inputs = self._factors_with_drift_and_noise(system, z, dH, dL, h)
+        turns = [
             B.spin_coefficients[..., None] * w.reshape(-1, 3)
             for B, w in factors_and_inputs
             if B.spin_coefficients is not None
         ]
-        # Solve for the turn of each spin at once: among many spins some turn far, and the iteration would be slow.
-        change = system.solve_at_spins(z, dH, sum(rotations), 0.5 * h, [field, *noise, -k[0]]) if rotations else None
-        return (sum(noise, field) if change is None else k[0] + change)[None]
+        if turns:
+            others = sum((B.times(w) for B, w in factors_and_inputs if B.spin_coefficients is None), jnp.zeros_like(z))
+            slopes = system.solve_at_spins(z, dH, dS, sum(turns[1:], turns[0]), others, 0.5 * h, k[0])
+            if slopes is not None:
+                return slopes[None]
+        return sum((B.times(w) for B, w in factors_and_inputs), system.field(z, dH, dS, dL))[None]
 
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
         z, dH, dS, dL = self.method.midpoint_and_gradients(system, x, compensation, h, k)
-        factors_and_inputs = self._factors_and_inputs(system, z, dH, dL, h)
+        factors_and_inputs = self._factors_with_drift_and_noise(system, z, dH, dL, h)
         return sum((B.velocity(w) for B, w in factors_and_inputs if B.velocity), start=system.transport(z, dH, dS, dL))[
             None
         ]
@@ -115,9 +117,9 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
             B.velocity is not None for _, B in terms_with_factors_at_state(system.total_dissipation, system, point)
         )
 
-    def _factors_and_inputs(self, system: System, z, dH, dL, h) -> list[tuple[Factor, jax.Array]]:
+    def _factors_with_drift_and_noise(self, system: System, z, dH, dL, h) -> list[tuple[Factor, jax.Array]]:
         """Return the factor of each summand with the vector, drift plus noise, that it is applied to."""
-        terms = terms_with_factors(system.total_dissipation, system, z, dH, dL)
+        terms = noisy_terms_with_factors(system.total_dissipation, system, z, dH, dL)
         split_indices = np.cumsum([B.size for _, B in terms])[:-1]
         drift = factor_divergences(system.total_dissipation, system, z)
         if self.log_density is not None:

@@ -195,7 +195,8 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     preserves = frozenset({"energy", "entropy_law", "casimirs"})
 
     def check(self, system: System) -> None:
-        """Raise InputError unless the system conserves the preserved functions, which must leave it room to move."""
+        """Raise InputError unless the system conserves the preserved functions, and these are fewer than its
+        dimensions."""
         check_preserved(system, self.functions)
         if not self.functions:
             return
@@ -276,7 +277,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         return stage_gradients(system.energy, x, compensation, h, k, A, b, kronrod_rule(self.number), symmetries)
 
     def _stage_slope(self, system: System, u, dH, dS, gradients_by_name: dict[str, StageGradients]) -> jax.Array:
-        """Return ``Pi_d dH + K_d dS`` at one stage."""
+        """Return the slope of one stage, ``Pi_d dH + K_d dS`` with discrete Poisson and friction matrices."""
         system = system.freeze_at(u)
         slope = self._conservative_slope(system, u, dH, gradients_by_name)
         keys_and_names = tuple(zip(preserved_by_name(system), preserved_names(system), strict=True))

@@ -149,7 +149,7 @@ class _Channel(NamedTuple):
 
     @classmethod
     def build(cls, system: System, structure: mf.DensityMatrices, time, h, order: int) -> _Channel:
-        """Return the map of a step of size h from a time, which is None if nothing depends on it."""
+        """Return the map of a step of size h from time t; t is None if the system does not depend on time."""
         body = _quantum_body(system)
         fractions = (0.0, 0.25, 0.5, 1.0)
         frozen = dict.fromkeys(fractions, body)
@@ -232,7 +232,7 @@ def _inverse_root(p):
 def _magnus_exponents(J0, J, J1, h, intervals) -> list[jax.Array]:
     """Return the exponents of W over parts of a step, of order 4, from ``-i H - ...`` at its start, middle and end.
 
-    The matrix is a quadratic polynomial of the time [Blanes et al. 2009].
+    Over a step ``-i H - ...`` is replaced by a quadratic polynomial in time [Blanes et al. 2009].
     """
     slope, curvature = J1 - J0, 2.0 * (J0 - 2.0 * J + J1)
     commutator = slope @ J - J @ slope

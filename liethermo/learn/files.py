@@ -82,7 +82,7 @@ def load(path: str | os.PathLike, system: T) -> T:
     Raises
     ------
     FileError
-        If there is no such file, it is damaged, or it holds a system that is built otherwise.
+        If there is no such file, it is damaged, or it holds a system of another structure.
     """
     metadata, arrays = read_archive(Path(path), MODEL_FORMAT)
     leaves, structure, static = _split_arrays(system)
@@ -94,8 +94,8 @@ def load(path: str | os.PathLike, system: T) -> T:
     ]
     if metadata.get("kind") != system.kind or shapes[0] != shapes[1]:
         raise FileError(
-            f"{path!s:.200} holds a {metadata.get('kind')} with {len(saved_leaves)} arrays, and this {system.kind} "
-            f"with {len(leaves)} is built otherwise: give load a system built like the one that was saved"
+            f"{path!s:.200} holds a {metadata.get('kind')} with {len(saved_leaves)} arrays, which does not "
+            f"match this {system.kind} with {len(leaves)}: pass a system built like the one that was saved"
         )
     loaded_system = eqx.combine(jax.tree_util.tree_unflatten(structure, list(map(jnp.asarray, saved_leaves))), static)
     if not all(np.isfinite(x).all() for x in saved_leaves if x.dtype.kind == "f"):

@@ -242,7 +242,7 @@ class _Labels:
 
 
 def _time_column(values: np.ndarray, labels: _Labels, label: str) -> np.ndarray:
-    if values.dtype.kind in "OUS" and not all(map(_is_number, values)):
+    if values.dtype.kind in "OUS" and not all(map(_converts_to_float, values)):
         with contextlib.suppress(TypeError, ValueError):
             values = values.astype("datetime64[ns]")
     if values.dtype.kind in "mM":  # dates and durations
@@ -272,13 +272,13 @@ def _numbers(values: np.ndarray, label: str) -> np.ndarray:
             raise TypeError
         return values.astype(np.float64)
     except (TypeError, ValueError):
-        example = next((value for value in values.tolist() if not _is_number(value)), values[0])
+        example = next((value for value in values.tolist() if not _converts_to_float(value)), values[0])
         raise InputError(
             f"column {label!r} must have numbers, got {example!r:.60}. Name the columns to read with columns="
         ) from None
 
 
-def _is_number(value: Any) -> bool:
+def _converts_to_float(value: Any) -> bool:
     try:
         float(value)
     except (TypeError, ValueError):
@@ -366,7 +366,7 @@ def _read_csv(path: Path):
         raise FileError(f"there is no file {path!s:.200}") from None
     except (OSError, UnicodeDecodeError, ValueError) as error:  # errors of the parser of pandas are ValueErrors
         raise FileError(f"{path!s:.200} could not be read as a table: {str(error).strip():.200}") from error
-    if all(_is_number(name.strip('"')) for name in map(str, frame.columns)):
+    if all(_converts_to_float(name.strip('"')) for name in map(str, frame.columns)):
         raise FileError(
             f"{path!s:.200} must begin with a line of names such as 't [s],gx [deg/s]', got {header.strip():.60}"
         )

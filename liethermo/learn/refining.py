@@ -403,7 +403,7 @@ def refine_by_least_squares(
 
 
 def _mean_squares(column_costs: np.ndarray, is_observed: np.ndarray, degrees_of_freedom: int) -> np.ndarray:
-    """Return the mean square residual of each observed number; the unknowns count for all numbers alike."""
+    """Return the residual variance of each observed component; each loses an equal share of the fitted parameters."""
     counts = is_observed.sum(axis=(0, 1))
     share = degrees_of_freedom / counts.sum() if degrees_of_freedom > 0 else np.nan
     return column_costs.sum(axis=0) / (np.maximum(counts, 1) * share)

@@ -18,15 +18,16 @@ from manifolds._pytree_module import Module
 from ..errors import InputError
 from ..functions.energy import Energy, Pullback, Sum
 from ..systems.base import System
-from ..systems.interface import EngineHints
+from ..systems.interface import EngineHints, MotionQuantities
 from ..tracing.programs import jit_unoptimised
 from .articulated_bodies import ArticulatedBodies, JointDamping, JointSprings, KineticEnergy, Motion
 from .parameters import checked_finite
 
-MAX_UNROLLED_JOINTS = 4
-"""Largest number of joint coordinates for which the compiled engine is chosen by itself.
+MAX_UNROLLED_NEWTON_JOINTS = 4
+"""Largest number of joint coordinates for which the compiled engine is chosen by itself for implicit methods.
 
-Steps of larger trees are compiled in seconds too, but Newton's method, which a step may need later, takes minutes."""
+Their steps for larger trees are compiled in seconds too, but Newton's method, which one may need later, takes minutes.
+"""
 
 JointRange = tuple[str, int, int]
 """Name of a body that has a joint, and the first and the last but one index of its coordinates in a state."""
@@ -80,7 +81,7 @@ class TreeSystem(System):
 
     @property
     def hints(self) -> EngineHints:
-        return super().hints._replace(can_unroll=self.mechanism.n_joints <= MAX_UNROLLED_JOINTS)
+        return super().hints._replace(can_unroll_newton=self.mechanism.n_joints <= MAX_UNROLLED_NEWTON_JOINTS)
 
     @with_library_settings
     def mass_matrix(self, q) -> jax.Array:
@@ -110,11 +111,13 @@ class TreeSystem(System):
         return {name: _entries(rates, start - first, end - first) for name, start, end in self.joint_ranges}
 
     @property
-    def velocity_functions(self):
+    def motion_quantities(self) -> MotionQuantities:
+        quantities = super().motion_quantities
         if not self.joint_ranges:
-            return super().velocity_functions
+            return quantities
         start, k = self.joint_ranges[0][1] + self.mechanism.n_joints, self.mechanism.n_joints
-        return super().velocity_functions | {"joint_rates": lambda x: self.energy.gradient(x)[start : start + k]}
+        velocities = {**quantities.velocities, "joint_rates": lambda x: self.energy.gradient(x)[start : start + k]}
+        return quantities._replace(velocities=velocities, joint_ranges=self.joint_ranges)
 
     @with_library_settings
     def _motion(self, x) -> Motion:

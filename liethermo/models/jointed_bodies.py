@@ -19,7 +19,7 @@ from manifolds.structures.poisson import PoissonStructure, ProductPoisson
 from ..errors import InputError
 from ..functions.energy import Energy, Quadratic
 from ..systems import HeatBaths, LiePoissonSystem
-from ..systems.interface import TorqueLaws
+from ..systems.interface import MotionQuantities, TorqueLaws
 from ..tracing.programs import jit_unoptimised
 from .articulated_bodies import ArticulatedBodies, JointSprings, KineticEnergy, SquaredMomentum
 from .joint_states import (
@@ -132,8 +132,9 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         kinetic = KineticEnergy(self.mechanism)
         return {name: SquaredMomentum(C, kinetic) for name, C in self.momentum_casimirs().items()}
 
-    def momentum_scale(self, x) -> jax.Array:
-        return KineticEnergy(self.mechanism).momentum_scale(x)
+    @property
+    def motion_quantities(self) -> MotionQuantities:
+        return super().motion_quantities._replace(momentum_scale=KineticEnergy(self.mechanism).momentum_scale)
 
     @property
     def inertia(self) -> None:

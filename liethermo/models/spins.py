@@ -91,7 +91,10 @@ def spin_lattice(
     if dmi is not None:
         terms += dzyaloshinskii_moriya(shape, dmi, periodic=periodic).terms
     if not isinstance(baths, HeatBaths | bool):
-        raise InputError(f"baths must be lt.HeatBaths, True for one as large as the lattice, or False, got {baths!r}")
+        raise InputError(
+            "baths must be lt.HeatBaths, True (one bath whose heat capacity is the number of sites) or False, "
+            f"got {baths!r}"
+        )
     lattice_baths = HeatBaths(capacity=float(np.prod(shape))) if baths is True else baths or None
     return SpinSystem(shape, Sum(tuple(terms)), LandauLifshitz(rate, bath), lattice_baths)
 

@@ -25,7 +25,7 @@ from ..tracing.interpret import evaluate_at_points
 from ..tracing.scalarize import UnsupportedPrimitive
 from .netcdf import SaveableResult
 from .rounding_scale import InvariantDrift
-from .step_sampling import StepSample, hermite_defect, sample_steps, vector_field_at
+from .step_sampling import StepSample, hermite_defect, select_step_sample, vector_field_at
 
 MAX_SENSITIVITY_STATES = 256
 """Largest number of states of a run at which the sensitivities of its functions are evaluated."""
@@ -269,7 +269,7 @@ class EvidenceCollector:
             return evidence
         user_states = np.asarray(self.system.points(sampled_x)).reshape(len(sampled_x), -1).view(np.float64)
         min_motion = MIN_MOTION_FRACTION * float(np.ptp(user_states, axis=0).max())
-        sample = sample_steps(
+        sample = select_step_sample(
             self.system, self.x[: n_steps + 1], self.t[: n_steps + 1], self.h, self.replay.states_after_steps
         )
         indices, defects = self._select_worst_steps(sample, min_motion)

@@ -37,7 +37,7 @@ from .netcdf import (
     split_complex,
     state_axis_names,
 )
-from .orientation import orientation_variables
+from .orientation import orientation_and_velocity_variables
 from .solution import Solution
 from .status import Laws, Stats, Status
 
@@ -380,7 +380,7 @@ class Ensemble(AuditableResult):
         for name, dims in (("attitude", series_dims), ("attitude0", ("trajectory",))):
             if (value := getattr(self, name)) is not None:
                 variables[name] = ((*dims, "row", "column", "part"), split_complex(value))
-        variables |= orientation_variables(self, series_dims)
+        variables |= orientation_and_velocity_variables(self, series_dims)
         variables |= self.events.dataset_variables()
         variables["status_text"] = ("trajectory", np.array([STATUS_NAMES[code] for code in self.status], dtype=object))
         is_failed = ~self.ok

@@ -362,7 +362,7 @@ def precession(solution: AuditableResult, axis=None) -> np.ndarray:
     return _unwrap_in_time(solution, angle)
 
 
-def orientation_variables(solution: AuditableResult, dims: tuple[str, ...]) -> dict[str, tuple]:
+def orientation_and_velocity_variables(solution: AuditableResult, dims: tuple[str, ...]) -> dict[str, tuple]:
     """Return the variables of a dataset that describe the orientation of a body, and velocities of body and joints.
 
     Parameters

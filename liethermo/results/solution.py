@@ -25,7 +25,7 @@ from .netcdf import (
     split_complex,
     state_axis_names,
 )
-from .orientation import orientation_variables
+from .orientation import orientation_and_velocity_variables
 from .status import Laws, Stats, Status
 
 
@@ -183,7 +183,8 @@ class _DeferredField:
 
 
 def deferred_fields(*names: str) -> Callable[[Class], Class]:
-    """Decorate a dataclass: the values of these fields may be given by :func:`defer`."""
+    """Decorate a dataclass so that the listed fields may hold a value of :func:`defer`, which is computed when it is
+    read."""
 
     def add_descriptors(cls: Class) -> Class:
         for name in names:
@@ -322,7 +323,7 @@ class Solution(AuditableResult):
         variables: dict[str, Any] = {"x": (("time", *state_axis_names(self.x.ndim - 1)), self.x), **series}
         if self.attitude is not None:
             variables["attitude"] = (("time", "row", "column", "part"), split_complex(self.attitude))
-        variables |= orientation_variables(self, ("time",))
+        variables |= orientation_and_velocity_variables(self, ("time",))
         variables["invariant"] = (
             ("invariant_name", "time"),
             np.array(list(self.casimirs.values())).reshape(len(self.casimirs), len(self.t)),

@@ -46,7 +46,7 @@ class StepSample(NamedTuple):
     x_end: np.ndarray
 
 
-def sample_steps(system: System, x: np.ndarray, t: np.ndarray, h: np.ndarray, replay: Callable) -> StepSample:
+def select_step_sample(system: System, x: np.ndarray, t: np.ndarray, h: np.ndarray, replay: Callable) -> StepSample:
     """Return a sample of the steps of a run: all, or if these are too many, those with the fastest motion.
 
     Parameters

@@ -142,7 +142,7 @@ class AdaptiveRun:
         first_step, t = int(self.state.step), self._scalar("t")
         try:
             max_attempts = self.attempts_per_call or ATTEMPTS_PER_CALL
-            attempts = self.runs.attempt_and_record(int(min(max_attempts, max(1.0, self.max_steps - first_step))))
+            attempts = self.runs.record_attempts(int(min(max_attempts, max(1.0, self.max_steps - first_step))))
         except UnsupportedPrimitive as error:
             self.runs = self.engine.resume_adaptive_on_array_engine(error, self.control, self.runs)
             self.pause_handler.adaptive_runs = self.runs

@@ -258,7 +258,8 @@ class _EnsembleOptions(NamedTuple):
             (run.run_compiled if engine == "compiled" else run.run_array)()
 
         calls_python = record.events is not None and record.events.calls_python
-        prefers_compiled = self.engine == "auto" and is_worth_compiling(record.member) and not calls_python
+        is_worthwhile = not calls_python and is_worth_compiling(record.member, record.method)
+        prefers_compiled = self.engine == "auto" and is_worthwhile
         if self.engine == "compiled" or prefers_compiled:
             try:
                 run_with_engine("compiled")

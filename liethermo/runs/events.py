@@ -140,7 +140,7 @@ def _prepared_event(
     name = "the event function" if len(specification.events) == 1 else f"event function {number}"
     direction = int(np.sign(getattr(event, "direction", 0) or 0))
     count = _terminal_count(event, is_terminal=scipy_arguments is None)
-    function = _traced_event(event, name, scipy_arguments, system, t, x)
+    function = _checked_event_function(event, name, scipy_arguments, system, t, x)
     return name, function, direction, None if count is None else count - counted, scipy_arguments is not None
 
 
@@ -230,7 +230,7 @@ def _parameter_arrays(system: System) -> list:
     return jax.tree_util.tree_leaves(eqx.filter(user_system(system), eqx.is_inexact_array))
 
 
-def _traced_event(
+def _checked_event_function(
     function: Callable, name: str, scipy_arguments: tuple | None, system: System, t: float, x
 ) -> EventFunction:
     """Return a user's event function for engines, traced if possible.

@@ -29,7 +29,7 @@ from ..systems import (
 )
 from ..systems.attitude import driven_system_or_none
 from ..systems.clock import WORK_NAME
-from ..systems.invariants import recorded_invariants, resolve_invariants_near, undecided_functions
+from ..systems.invariants import recorded_functions_with_verdicts, resolve_invariants_near, undecided_functions
 from ..systems.transport import has_generator
 from ..tracing.caching import LRUCache, memoize
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
@@ -249,7 +249,7 @@ def invariants_and_laws(system: System, method) -> tuple[dict, Laws]:
         method.check(system)
         if not is_library_object(method):
             check_shapes_of_method(system, method)
-    recorded = recorded_invariants(system)
+    recorded = recorded_functions_with_verdicts(system)
     return recorded, promised_laws(system, method, recorded)
 
 

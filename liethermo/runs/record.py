@@ -209,7 +209,7 @@ class EnsembleRecord:
             reasons={**reasons, **self.failure_reasons},
             provenance={**provenance, "engine": engine},
             evidence_source=self._evidence_source(replay),
-            velocity_sources=self._velocity_sources(),
+            velocity_sources=self._velocity_functions_by_name(),
             solution_builder=self._build_solution,
             **quantities,
             **fields,
@@ -225,11 +225,11 @@ class EnsembleRecord:
         ]
         return lambda: merge_evidence([collect() for collect in collectors])
 
-    def _velocity_sources(self) -> dict[str, Callable[[], np.ndarray]]:
+    def _velocity_functions_by_name(self) -> dict[str, Callable[[], np.ndarray]]:
         """Return functions that compute the velocities of all trajectories, by the names of the velocities."""
         if self.x is None and self.trajectories is None:
             return {}
-        return {name: functools.partial(self._velocities, name) for name in self.member.velocity_functions}
+        return {name: functools.partial(self._velocities, name) for name in self.member.motion_quantities.velocities}
 
     def _velocities(self, name: str) -> np.ndarray:
         parts = [group.velocities(name) for group in self.groups]
@@ -566,7 +566,8 @@ class EnsembleEvidenceCollector:
 def _sampled_saved_states(
     record: EnsembleRecord, sample: np.ndarray
 ) -> tuple[Sequence[np.ndarray] | np.ndarray, np.ndarray]:
-    """Return saved states of trajectories with these numbers, shape (sample, times, n), and times spread over the run.
+    """Return saved states of the trajectories with these indices, shape (sample, times, n), at times spread over the
+    run.
 
     Both are empty if the run keeps no states.
     """

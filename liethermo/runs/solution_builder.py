@@ -38,7 +38,7 @@ class RecordedFunctions(NamedTuple):
     has_user_states : bool
         Whether states of a run have the form that the user sees.
     velocity_names : tuple of str
-        Names of the velocities that the system has: see :attr:`liethermo.System.velocity_functions`.
+        Names of the velocities that the system has: see :attr:`liethermo.System.motion_quantities`.
     """
 
     invariants: dict[str, Energy]
@@ -51,7 +51,9 @@ class RecordedFunctions(NamedTuple):
         """Return the recorded functions, with invariants as :func:`.preparation.invariants_and_laws` returns them."""
         functions = {name: f for name, (f, _) in invariants.items()}
         has_user_states = type(system).to_user_solution is System.to_user_solution and not system.sites
-        return cls(functions, {**functions, **system.ledger}, has_user_states, tuple(system.velocity_functions))
+        return cls(
+            functions, {**functions, **system.ledger}, has_user_states, tuple(system.motion_quantities.velocities)
+        )
 
 
 def build_solution(
@@ -100,7 +102,7 @@ def velocities_at_states(name: str, system: System, x: np.ndarray) -> np.ndarray
 
 
 def _velocities(system: System, x) -> dict[str, Any]:
-    return {name: velocity(x) for name, velocity in system.velocity_functions.items()}
+    return {name: velocity(x) for name, velocity in system.motion_quantities.velocities.items()}
 
 
 """Functions of a system and a state, shape (n,), to velocities, shape (k,), by the name of the result."""
@@ -147,6 +149,7 @@ def run_provenance(
 
     ``end_time`` is the time at which the run ended, in seconds as of ``time.time()``; by default now.
     """
+    joint_ranges = system.motion_quantities.joint_ranges
     algebra, group, inertia = system.lie_algebra, system.matrix_group, system.inertia
     return {
         "library": f"liethermo {_library_version()}",
@@ -164,7 +167,7 @@ def run_provenance(
         "inertia": None if inertia is None else inertia.tolist(),
         "dissipation": dissipation_name(system.dissipation),
         **({"torque": system.torque_laws.name} if system.torque_laws.name else {}),
-        **({"joints": {name: [start, end] for name, start, end in system.joint_ranges}} if system.joint_ranges else {}),
+        **({"joints": {name: [start, end] for name, start, end in joint_ranges}} if joint_ranges else {}),
         **entries,
     }
 

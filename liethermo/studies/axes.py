@@ -79,7 +79,7 @@ def zipped(**columns) -> Zipped:
 
 
 def replicas(states) -> Zipped:
-    """Return an axis of initial states, ``axes={"replica": lt.replicas(states)}``, or of repeated runs with noise.
+    """Return an axis of a study over given initial states, or over repeated runs with noise.
 
     Parameters
     ----------

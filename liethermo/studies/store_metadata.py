@@ -340,8 +340,8 @@ LOCK_FILE = ".lock"
 def lock_store(root: Path) -> Iterator[Callable[[int], None]]:
     """Lock a store for one run; the operating system releases the lock when the process ends.
 
-    Yields a function ``record_run(n_done)`` that writes the run's host, process id, start time and number of finished
-    points for other processes.
+    Yields a function ``record_run(n_done)`` that writes the run's host, process id, start time and number of
+    finished points to the lock file, where other processes can read them.
 
     Raises
     ------

@@ -270,7 +270,7 @@ def _spatial_momentum_and_scale(system: AttitudeSystem, x) -> tuple[jax.Array, j
     (state, g), p = system.split_state(x), system.spatial_impulse(x)
     mu, action = state[: system.group.dim], system.spatial_action(g)
     momentum = mu @ action
-    scale = jnp.maximum(jnp.max(jnp.abs(mu) @ jnp.abs(action)), system.body.momentum_scale(state))
+    scale = jnp.maximum(jnp.max(jnp.abs(mu) @ jnp.abs(action)), system.body.motion_quantities.momentum_scale(state))
     return momentum - p if system.impulse_dim else momentum, scale
 
 

@@ -127,7 +127,7 @@ class HeatBaths(Module):
         return 1.0 if is_traced(self.energy) else np.asarray(self.entropy_scales())
 
     def entropy_scales(self) -> jax.Array:
-        """Return :attr:`scale` as an array that JAX can trace, shape (number,)."""
+        """Return the scale of the entropy of each bath, as an array that JAX can trace, shape (number,)."""
         if not isinstance(self.energy, BathEnergy):  # any scale suits a bath of constant temperature
             return jnp.ones(self.number)
         return jnp.where(jnp.isfinite(self.energy.capacity), self.energy.capacity, 1.0)

@@ -47,7 +47,7 @@ def is_given_by_velocity(system, x, angular_velocity, instead: str, **details) -
         return False
     if x is not None:
         raise InputError("state needs x or angular_velocity=, got both")
-    if "angular_velocity" not in system.velocity_functions:
+    if "angular_velocity" not in system.motion_quantities.velocities:
         raise InputError(f"a system on {system.algebra.name} has no angular velocity: give its {instead}")
     return True
 

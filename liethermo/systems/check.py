@@ -174,7 +174,8 @@ def _axiom_row(system: Any, name: str, values: np.ndarray, axiom: str, note: str
 
 
 def _momentum_map_row(system: Any, name: str, values: np.ndarray) -> CheckRow:
-    """Return the row of a momentum map at the points inside its own domain, if there are any."""
+    """Return the row of the report on a momentum map, from the points at which it is defined; None without such
+    points."""
     is_defined = np.isfinite(values)
     if not is_defined.any():
         return CheckRow(name, float("nan"), AXIOM_TOLERANCE, False, "it is not finite at any of the points")

@@ -154,10 +154,14 @@ class DrivenSystem(LiftedSystem):
         """Return the system with a fixed torque, shape (body.dim,)."""
         return replace_fields(self, torque=torque)
 
-    def solve_at_spins(self, x, dH, noise_rates, half_step, velocities):
-        body_velocities = [v[:-2] for v in velocities]
-        u = self.body.solve_at_spins(x[:-2], dH[:-2], noise_rates, half_step, body_velocities)
-        return None if u is None else jnp.concatenate([u, sum(v[-2:] for v in velocities)])
+    def solve_at_spins(self, x, dH, dS, noise_rates, others, half_step, k):
+        inner, clock_velocity = self.inner_at(x).drop_torque(), _clock_velocity(dH, self.unit) + others[-2:]
+        if self.torque_laws.name:
+            torque_velocity = self.torque_velocity(x, dH)
+            others, clock_velocity = others + torque_velocity, clock_velocity + torque_velocity[-2:]
+        x, dH, dS, _ = self.inner_arguments(x, dH, dS, ())
+        slopes = inner.solve_at_spins(x, dH, dS, noise_rates, others[:-2], half_step, k[:-2])
+        return None if slopes is None else jnp.concatenate([slopes, clock_velocity])
 
     def raise_index(self, x, alpha):
         """Return the direction of a correction along alpha, without components along the clock and the work."""

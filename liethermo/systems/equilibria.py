@@ -351,7 +351,8 @@ class _Search(NamedTuple):
     counters: np.ndarray
 
     def evaluate(self, points: np.ndarray) -> FieldDerivatives:
-        """Return velocities and functions with their derivatives, the counters left out; the first axis is points."""
+        """Return velocities and functions at points, axis 0, with derivatives by the state; clock and work are left
+        out."""
         derivatives = evaluate_at_points(field_derivatives, (self.system, self.functions), points)
         if not self.counters.size:
             return FieldDerivatives(*derivatives)

@@ -26,7 +26,7 @@ from ..functions.newton import inverse_gradient
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.traced import trace_callables
 from .body_states import checked_velocity, is_given_by_velocity
-from .interface import EngineHints
+from .interface import EngineHints, MotionQuantities
 from .ledger import LedgerSystem
 from .lie_poisson import LiePoissonSystem, body_velocity_slices
 from .states import evaluate_batch
@@ -307,8 +307,9 @@ class EulerPoincareClosedSystem(LedgerSystem):
         return cast(VelocityLiePoisson, self.structure).momentum_derivatives(x[: self.dim_without_ledger])[1:]
 
     @property
-    def velocity_functions(self):
-        return {name: lambda x, part=part: x[part] for name, part in body_velocity_slices(self.algebra).items()}
+    def motion_quantities(self) -> MotionQuantities:
+        parts = body_velocity_slices(self.algebra)
+        return MotionQuantities({name: lambda x, part=part: x[part] for name, part in parts.items()})
 
     def temperature_at(self, y) -> jax.Array:
         return -jax.grad(self.lagrangian, argnums=1)(y[:-1], y[-1])

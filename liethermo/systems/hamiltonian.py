@@ -205,7 +205,7 @@ def _density_of_kets(ket: np.ndarray) -> np.ndarray:
 
 
 def checked_parts(parts, names, size: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Return the dimensions of the factors of a product, and their names."""
+    """Return the dimensions and the names of the parts of a composite quantum system, checked."""
     parts = (size,) if parts is None else tuple(int(n) for n in parts)
     if math.prod(parts) != size or min(parts) < 1:
         raise InputError(f"the product of the sizes of the parts must be {size}, got the sizes {parts}")

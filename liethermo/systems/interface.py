@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
@@ -54,6 +55,25 @@ class OrbitLevels(NamedTuple):
     has_all_casimirs: bool = False
 
 
+class MotionQuantities(NamedTuple):
+    """Velocities and joints of rigid bodies in a system, for its solutions.
+
+    Attributes
+    ----------
+    velocities : mapping from names to functions of a state, shape (n,), to an array, shape (k,)
+        The names are ``angular_velocity`` of a rigid body, in body axes, ``rotor_rates`` of its rotors relative to it,
+        and ``joint_rates``. Joint rates have the order of ``joint_ranges``.
+    joint_ranges : tuple of (str, int, int)
+        Names of bodies with a joint, and the first and the last but one index of its coordinates in a state.
+    momentum_scale : function from a state, shape (n,), to a number, shape ()
+        Returns the size of terms that cancel in the momentum; zero if there are none.
+    """
+
+    velocities: Mapping[str, Callable] = MappingProxyType({})
+    joint_ranges: tuple[tuple[str, int, int], ...] = ()
+    momentum_scale: Callable[[Any], jax.Array] = lambda x: jnp.zeros(())
+
+
 class SparseNewton(NamedTuple):
     """Functions of a system for Newton's method with a sparse Jacobian; by default no pattern is known.
 
@@ -77,6 +97,8 @@ class EngineHints(NamedTuple):
     ----------
     can_unroll : bool
         Whether the compiled engine is worth trying; False if the system needs a loop.
+    can_unroll_newton : bool
+        Whether it is worth trying for methods too whose steps may need Newton's method.
     has_matrix_functions : bool
         Whether the system consists of matrix functions, which XLA compiles more slowly than the compiled engine.
     is_smooth : bool
@@ -84,6 +106,7 @@ class EngineHints(NamedTuple):
     """
 
     can_unroll: bool = True
+    can_unroll_newton: bool = True
     has_matrix_functions: bool = False
     is_smooth: bool = True
 
@@ -152,23 +175,10 @@ class SystemInterface(Geometry):
         """
         return None
 
-    def momentum_scale(self, x) -> jax.Array:
-        """Return the size of terms that cancel in the momentum at x, shape (); zero if there are none."""
-        return jnp.zeros(())
-
     @property
-    def joint_ranges(self) -> tuple[tuple[str, int, int], ...]:
-        """Names of bodies with a joint, and the first and the last but one index of its coordinates in a state."""
-        return ()
-
-    @property
-    def velocity_functions(self) -> dict[str, Callable]:
-        """Functions of a state, shape (n,), to velocities that a solution shows, shape (k,), by name.
-
-        They are ``angular_velocity`` of a rigid body, in body axes, ``rotor_rates`` of its rotors relative to it, and
-        ``joint_rates`` in the order of :attr:`joint_ranges`.
-        """
-        return {}
+    def motion_quantities(self) -> MotionQuantities:
+        """Velocities and joints of rigid bodies in the system; empty for other systems."""
+        return MotionQuantities()
 
     @property
     def inner(self) -> SystemInterface | None:
@@ -271,19 +281,24 @@ class SystemInterface(Geometry):
 
     # -- spins ----------------------------------------------------------------------------------------------------
 
-    def solve_at_spins(self, x, dH, noise_rates, half_step, velocities: Sequence) -> jax.Array | None:
-        """Return u with ``u_i - half_step J_i u_i = v_i`` at each spin, and ``u = v`` elsewhere; None without spins.
+    def solve_at_spins(self, x, dH, dS, noise_rates, others, half_step, k) -> jax.Array | None:
+        """Return the slopes of a step from earlier slopes k, solved at each spin in its present field; None without
+        spins.
 
-        J_i is the derivative by s_i, at the given gradient dH, of the velocity of spin i.
+        A solution of ``k = v`` is kept, where v is the field plus the turn by noise plus ``others``. Each spin gets
+        ``k_i + u_i`` with ``u_i - half_step J_i u_i = v_i - k_i``, J_i the derivative of v_i by s_i at the given
+        gradient dH, and the other components get v.
 
         Parameters
         ----------
-        x, dH : array, shape (n,)
+        x, dH, dS : array, shape (n,)
+            Midpoint of the step and gradients there.
         noise_rates : array, shape (sites, 3) or (1, 3)
             Angular velocities by noise (1 / time).
+        others : array, shape (n,)
+            Velocity by other noise.
         half_step : array, shape ()
-        velocities : sequence of arrays, shape (n,)
-            Summands of v.
+        k : array, shape (n,)
         """
         return None
 

@@ -73,7 +73,8 @@ def functions_for_naming(system: SystemInterface) -> tuple[Energy, ...]:
 
 
 def names_from_multiples(system: SystemInterface, multiples: Sequence[int]) -> tuple[str, ...]:
-    """Return the name of each preserved function: that of the function it is a multiple of, or its own.
+    """Return a name for each preserved function: that of a known function of which it is a multiple, or else its
+    own.
 
     Parameters
     ----------
@@ -172,10 +173,10 @@ def invariants_by_construction(system: SystemInterface) -> frozenset[str]:
     return frozenset(system.momentum_maps) | (constant_casimirs - system.torque_laws.changed_casimirs)
 
 
-def recorded_invariants(system: SystemInterface) -> dict[str, tuple[Energy, bool | None]]:
+def recorded_functions_with_verdicts(system: SystemInterface) -> dict[str, tuple[Energy, bool | None]]:
     """Return functions to record along a run, by name, each with whether it is conserved; None if not known."""
     if system.inner is not None:
-        inner_verdicts = recorded_invariants(system.inner)
+        inner_verdicts = recorded_functions_with_verdicts(system.inner)
         return {name: (f.on(range(system.inner.dim)), verdict) for name, (f, verdict) in inner_verdicts.items()}
     verdicts = find_invariants(system)
     return {

@@ -60,7 +60,7 @@ class LedgerSystem(System):
         def check(function, result_shape, what):
             if function is None:
                 return None
-            checked = check_state_function(function, parts, result_shape, what, at)
+            checked = checked_state_function(function, parts, result_shape, what, at)
             return checked if len(shape) == 1 else FlattenedFunction(checked, shape)
 
         if friction is None or callable(friction):
@@ -272,7 +272,7 @@ def add_time_argument(function: Callable, n_arguments: int = 3) -> Callable:
     return LastArgumentIgnored(function) if required_argument_count(function) == n_arguments else function
 
 
-def check_state_function(
+def checked_state_function(
     function, parts: tuple[tuple[int, ...], ...], shape: tuple[int, ...], what: str, at: str
 ) -> Callable:
     """Return a checked function of (..., t) from a function with or without the argument t, or from a constant.

@@ -21,13 +21,13 @@ from ..tracing.caching import memoize
 from ..tracing.interpret import evaluate_at_points
 from .baths import BathEntropy, HeatBaths
 from .body_states import checked_velocity, entropies_of_temperatures, is_given_by_velocity, momentum_of_velocity
-from .interface import TORQUE_FREE_LAWS, OrbitLevels, TorqueLaws
+from .interface import TORQUE_FREE_LAWS, MotionQuantities, OrbitLevels, TorqueLaws
 from .torque import (
     MAX_ARGUMENTS,
     MAX_ARGUMENTS_WITHOUT_ATTITUDE,
     TorqueSystem,
     begins_with_rotations,
-    check_torque,
+    checked_torque,
     evaluate_torque,
     torque_free_components,
     torque_name,
@@ -162,9 +162,11 @@ class LiePoissonSystem(TorqueSystem):
         return _inertia_tensor(energy, self.algebra.dim) if energy.is_quadratic else None
 
     @property
-    def velocity_functions(self):
+    def motion_quantities(self) -> MotionQuantities:
         parts = body_velocity_slices(self.algebra)
-        return {name: lambda x, part=part: self.energy.gradient(x)[part] for name, part in parts.items()}
+        return MotionQuantities(
+            {name: lambda x, part=part: self.energy.gradient(x)[part] for name, part in parts.items()}
+        )
 
     def state(
         self, x=None, batch: bool = False, *, angular_velocity=None, rotor_rates=None, temperature=None, t=None
@@ -226,7 +228,7 @@ class LiePoissonSystem(TorqueSystem):
 
     def _set_torque(self, torque) -> None:
         """Set the fields of the torque of a system with an algebra and a group."""
-        self.torque, self.torque_argument_counts = check_torque(torque, self.algebra, self.group)
+        self.torque, self.torque_argument_counts = checked_torque(torque, self.algebra, self.group)
         self.torque_free_components = ()
         if torque is not None:
             model = self.torque, self.torque_argument_counts

@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 
 from manifolds._pytree_module import forward_to
@@ -14,7 +13,7 @@ from ..dissipation.base import LiftedDissipation, LiftedGeometry
 from ..functions.energy import Energy
 from .base import System
 from .domain import Domain
-from .interface import EngineHints
+from .interface import EngineHints, MotionQuantities
 
 
 class LiftedSystem(System):
@@ -78,14 +77,16 @@ class LiftedSystem(System):
         return self.inner
 
     @property
-    def velocity_functions(self):
+    def motion_quantities(self) -> MotionQuantities:
+        n, inner = self.inner.dim, self.inner.motion_quantities
+
         def velocity(name: str, x):
-            return self.inner_at(x).velocity_functions[name](x[: self.inner.dim])
+            return self.inner_at(x).motion_quantities.velocities[name](x[:n])
 
-        return {name: partial(velocity, name) for name in self.inner.velocity_functions}
-
-    def momentum_scale(self, x) -> jax.Array:
-        return self.inner.momentum_scale(x[: self.inner.dim])
+        return inner._replace(
+            velocities={name: partial(velocity, name) for name in inner.velocities},
+            momentum_scale=lambda x: inner.momentum_scale(x[:n]),
+        )
 
     @property
     def hints(self) -> EngineHints:
@@ -93,7 +94,6 @@ class LiftedSystem(System):
 
     torque_laws = forward_to("inner")
     orbit_levels = forward_to("inner")
-    joint_ranges = forward_to("inner")
     surface = forward_to("inner")
 
 

@@ -18,13 +18,14 @@ from manifolds.structures.poisson import ProductPoisson
 from manifolds.structures.spins import add_vectors, cross, cross_vectors, dot_vectors, scale_vectors, split_vectors
 
 from ..dissipation.base import Dissipation
+from ..dissipation.geometry import HeatingSites
 from ..dissipation.heating import BathConduction, Heating
 from ..dissipation.landau_lifshitz import LandauLifshitz
 from ..errors import InputError
 from ..functions.checks import traced_function_and_shape
 from ..functions.energy import Energy
 from ..functions.magnetism.spin_energy import lattice_shape
-from ..functions.magnetism.spin_torques import check_spin_torque
+from ..functions.magnetism.spin_torques import checked_spin_torque
 from ..functions.on_spaces import (
     HalfSumOfSquares,
     Spheres,
@@ -110,7 +111,7 @@ class SpinSystem(TorqueSystem):
         power=None,
     ):
         self.lattice = lattice_shape(sites)
-        self.torque = None if torque is None else check_spin_torque(torque, self.lattice)
+        self.torque = None if torque is None else checked_spin_torque(torque, self.lattice)
         self.torque_arguments = None
         self.powered_baths, self.power = _checked_powers(power, baths)
         poisson = mf.Spins(self.lattice, ratio=ratio)
@@ -120,8 +121,9 @@ class SpinSystem(TorqueSystem):
         return flatten_site_functions(energy, (*self.lattice, 3))
 
     @property
-    def heating_sites(self) -> tuple[int, ...]:
-        return self.lattice
+    def heating_sites(self) -> HeatingSites:
+        assert self._spin_structure is not None
+        return _HeatingSpins(self.lattice, self._spin_structure)
 
     def _field_without_torque(self, x, dH, dS, dL):
         # precession and damping of the spins are added before they are stored in a state
@@ -170,43 +172,39 @@ class SpinSystem(TorqueSystem):
     def drop_baths(self):
         return _drop_power(super().drop_baths())
 
-    def scale_at_sites(self, values, v) -> jax.Array:
-        """Return a vector v multiplied by ``values``, one for each site or one for all."""
-        spins = self._spin_structure
-        assert spins is not None
-        return (
-            spins.join_state(scale_vectors(values, spins.split_covectors(v)), jnp.zeros(0))
-            if jnp.ndim(values)
-            else values * v
-        )
-
-    def dot_at_sites(self, alpha, v) -> jax.Array:
-        spins = self._spin_structure
-        assert spins is not None
-        return dot_vectors(spins.split_covectors(alpha), spins.split_covectors(v))
-
-    def solve_at_spins(self, x, dH, noise_rates, half_step, velocities) -> jax.Array | None:
-        """Return u with ``u_i - half_step J_i u_i = v_i`` at each spin and u = v elsewhere, v the sum of velocities.
+    def solve_at_spins(self, x, dH, dS, noise_rates, others, half_step, k) -> jax.Array | None:
+        """Return the slopes of a step from earlier slopes k, solved at each spin in its present field.
 
         Noise, precession and damping turn s at the angular velocity ``w - gamma dH - lambda s x dH``, and damping has
-        the factor ``lambda s . dH`` besides. So ``c u - a x u = v`` with the angle a in half a step, which has the
-        solution ``u = (c v + a x v + (a . v) a / c) / (c^2 + |a|^2)``, as ``c a . u = a . v``.
+        the factor ``lambda s . dH`` besides. So ``c u - a x u = r`` with the angle a in half a step, which has the
+        solution ``u = (c r + a x r + (a . r) a / c) / (c^2 + |a|^2)``, as ``c a . u = a . r``.
         """
         spins, parts, n = self._spin_structure, _split_damping(self.total_dissipation), self.body_dim
-        if spins is None:
+        if spins is None or parts is None:
             return None
-        s, gradient, c = spins.split_covectors(x), spins.split_covectors(dH), jnp.ones(())
-        precession = scale_vectors(-half_step * spins.ratio.reshape(-1), gradient)
-        a = add_vectors(split_vectors(half_step * noise_rates), precession)
-        if parts is not None:
-            signs = 1.0 if parts.heating is None else parts.heating.temperature_signs(dH[n:])
-            rate = -half_step * signs * parts.damping.rate.reshape(-1)
-            a = add_vectors(a, scale_vectors(rate, cross_vectors(s, gradient)))
-            c = jnp.maximum(1.0 + rate * dot_vectors(s, gradient), MIN_DAMPING_FACTOR)
-        v = functools.reduce(add_vectors, map(spins.split_covectors, velocities))
-        u = add_vectors(add_vectors(scale_vectors(c, v), cross_vectors(a, v)), scale_vectors(dot_vectors(a, v) / c, a))
-        others = sum(velocity[n:] for velocity in velocities)
-        return spins.join_state(scale_vectors(1.0 / (c * c + dot_vectors(a, a)), u), others)
+        damping, heating, conduction = parts
+        s, gradient = spins.split_covectors(x), spins.split_covectors(dH)
+        rate = -damping.rate.reshape(-1) * (1.0 if heating is None else heating.temperature_signs(dH[n:]))
+        rates = add_vectors(split_vectors(noise_rates), scale_vectors(-spins.ratio.reshape(-1), gradient))
+        rates = add_vectors(rates, scale_vectors(rate, cross_vectors(s, gradient)))
+        v, entropy_rates = cross_vectors(rates, s), others[n:]
+        if heating is not None:
+            lost_power = -dot_vectors(gradient, v)
+            entropy_rates = entropy_rates + heating.entropy_rates(
+                lost_power if heating.has_site_baths else jnp.sum(lost_power), dH[n:]
+            )
+        for term in conduction:
+            entropy_rates = entropy_rates + term.entropy_rates(dH[n:], dS[n:])
+        v = add_vectors(v, spins.split_covectors(others))
+        if (external_velocity := self.external_velocity(x, dH)) is not None:
+            v = add_vectors(v, spins.split_covectors(external_velocity))
+            entropy_rates = entropy_rates + external_velocity[n:]
+        slopes = spins.split_covectors(k)
+        r, a = add_vectors(v, scale_vectors(-1.0, slopes)), scale_vectors(half_step, rates)
+        c = jnp.maximum(1.0 + half_step * rate * dot_vectors(s, gradient), MIN_DAMPING_FACTOR)
+        u = add_vectors(add_vectors(scale_vectors(c, r), cross_vectors(a, r)), scale_vectors(dot_vectors(a, r) / c, a))
+        u = scale_vectors(1.0 / (c * c + dot_vectors(a, a)), u)
+        return spins.join_state(add_vectors(slopes, u), entropy_rates)
 
     def largest_step(self, x, angle: float = 0.3, boltzmann: float = 0.0, t: float = 0.0) -> float:
         """Return the step (time) in which no spin turns by more than an ``angle``, in its field or by noise.
@@ -275,6 +273,20 @@ class SpinSystem(TorqueSystem):
         """Poisson structure of the spins; None if the system runs in other coordinates."""
         poisson = self.poisson.first if isinstance(self.poisson, ProductPoisson) else self.poisson
         return poisson if isinstance(poisson, mf.Spins) else None
+
+
+class _HeatingSpins(HeatingSites):
+    """Sites with a spin each, in the order of components of a Poisson structure."""
+
+    def __init__(self, shape: tuple[int, ...], spins: mf.Spins):
+        super().__init__(shape)
+        self._spins = spins
+
+    def _scale_each(self, values, v) -> jax.Array:
+        return self._spins.join_state(scale_vectors(values, self._spins.split_covectors(v)), jnp.zeros(0))
+
+    def dot(self, alpha, v) -> jax.Array:
+        return dot_vectors(self._spins.split_covectors(alpha), self._spins.split_covectors(v))
 
 
 class ReorderedSystem(NamedTuple):

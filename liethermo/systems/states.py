@@ -16,7 +16,8 @@ from ..errors import InputError
 
 
 def checked_state_array(system: Any, x, batch: bool = False) -> np.ndarray | jax.Array:
-    """Return the state x of a system as an array, checked as by ``system.state``; of NumPy unless JAX traces it."""
+    """Return the state x of a system as an array that ``system.state`` has checked: of JAX if JAX traces x, else of
+    NumPy."""
     if not isinstance(x, jax.Array):
         try:
             x = np.asarray(x)

@@ -85,7 +85,7 @@ class TorqueSystem(System):
         return super().field(x, dH, dS, dL)
 
 
-def check_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | None) -> tuple[Any, tuple[int, ...]]:
+def checked_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | None) -> tuple[Any, tuple[int, ...]]:
     """Return a checked torque with its plain functions traced, and the number of arguments of each of its terms.
 
     Raises

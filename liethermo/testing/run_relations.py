@@ -95,7 +95,7 @@ NOISE_BOLTZMANN = 1e-6
 def check_engines(case: RelationCase) -> SkipReason:
     """Check that all engines take equal steps."""
     case.compare_run("array engine", case.run(engine="array"))
-    if not is_worth_compiling(case.system):
+    if not is_worth_compiling(case.system, case.method):
         return None
     try:
         case.compare_run("compiled engine", case.run(engine="compiled"))

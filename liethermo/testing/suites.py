@@ -89,7 +89,7 @@ def check_laws_along_run(suite: Suite, system: System, method: OneStepMethod, x0
     )
     is_identical = np.array_equal(solution.x, rebuilt_run.x) and solution.laws == rebuilt_run.laws
     suite.check_true(f"{label}the same to the bit when taken apart and put together", is_identical)
-    if is_worth_compiling(system):
+    if is_worth_compiling(system, method):
         try:
             compiled_run = integrate(system, x0, (0.0, N_STEPS * h), h, method, on_failure="return", engine="compiled")
         except UnsupportedPrimitive as error:

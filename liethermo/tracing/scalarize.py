@@ -348,7 +348,7 @@ class _LoopScope(EnclosingScope):
     """The scope of a loop body: the outer scalars that the body reads are its first input."""
 
     def import_arrays(self, arrays: Sequence[np.ndarray], avals: Sequence) -> list[np.ndarray]:
-        """Return arrays of outer scalars as the loop body reads them."""
+        """Return arrays of values from outside the loop, as symbols by which its body refers to them."""
         return unflatten_scalars(
             (self.import_scalar(a) if type(a) is str else a for a in flatten_scalars(arrays)), avals
         )

@@ -482,7 +482,7 @@ def _call_rule(recurrences: _Recurrences, eqn, values) -> list:
 
 
 def _cond_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """Return the series of ``cond``: those of every branch, selected by the branch at the start."""
+    """Return the Taylor series of ``cond``: that of the branch which the point of expansion selects."""
     branch_index, *values = values
     results = [recurrences.evaluate_jaxpr(branch.jaxpr, branch.consts, values) for branch in eqn.params["branches"]]
 

@@ -352,7 +352,7 @@ class CompiledAdaptiveRuns:
     def state(self) -> State:
         return self.step_loop.state_from_block(self.blocks.copy())
 
-    def attempt_and_record(self, max_attempts: int) -> dict[str, np.ndarray]:
+    def record_attempts(self, max_attempts: int) -> dict[str, np.ndarray]:
         """Make up to ``max_attempts`` attempts of the only trajectory and return their records: see ATTEMPT_FIELDS."""
         n_before, out = self.read("n_attempts")[0], np.empty((1, max_attempts, self.step_loop.n_saved_values))
         try:

@@ -197,7 +197,7 @@ class _StepLoopWriter(ProgramWriter):
                     self.has_true_lane(is_running()), build.icmp_signed("<", build.load(steps_done), end_step)
                 )
             ):
-                self.load_noise_increments(build.add(build.mul(i, total_steps), build.load(steps_done)))
+                self.copy_noise_increments_to_slots(build.add(build.mul(i, total_steps), build.load(steps_done)))
                 self.active_lanes = is_running()
                 self.write_program_and_store_results("step")
                 self.active_lanes = None
@@ -224,7 +224,7 @@ class _StepLoopWriter(ProgramWriter):
         self.builder.store(self.builder.gep(self.arguments["blocks"], [offset]), self.block)
         self.builder.store(i, self.block_index)
 
-    def load_noise_increments(self, step_number: ir.Value) -> None:
+    def copy_noise_increments_to_slots(self, step_number: ir.Value) -> None:
         """Load the increments of a step from row ``step_number`` of ``noise``."""
         build, slots = self.builder, self.slots["dW"]
         row = build.mul(step_number, self.int64(len(slots) * self.lanes))

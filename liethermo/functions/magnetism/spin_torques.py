@@ -1,4 +1,4 @@
-"""What drives spins: torques by currents (Slonczewski, Zhang and Li, spin-orbit), and the power of a laser pulse."""
+"""Drives of spins: torques by currents (Slonczewski, Zhang and Li, spin-orbit), and the power of a laser pulse."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def _amplitude(value, t) -> jax.Array:
     return amplitude[..., None] if amplitude.ndim else amplitude
 
 
-def check_spin_torque(torque, sites: tuple[int, ...]) -> tuple[Callable, ...]:
+def checked_spin_torque(torque, sites: tuple[int, ...]) -> tuple[Callable, ...]:
     """Return a checked tuple of functions w(t, s) of torques ``s x w``.
 
     Raises

@@ -110,7 +110,7 @@ def cumulant_crossing(a: MagnetSamples, b: MagnetSamples) -> Estimate:
     InputError
     """
     if a.temperature != b.temperature:
-        raise InputError(f"both lattices need one temperature, got {a.temperature:g} and {b.temperature:g}")
+        raise InputError(f"both lattices must have the same temperature, got {a.temperature:g} and {b.temperature:g}")
     squares = [_checked_squares(samples.magnetisation) for samples in (a, b)]
     energies = [np.asarray(samples.energy, dtype=float) for samples in (a, b)]
     for square, energy in zip(squares, energies, strict=True):

@@ -109,7 +109,7 @@ class VariationalIntegrator(OneStepMethod):
     def verlet(cls, retraction: str | mf.Retraction | None = None) -> VariationalIntegrator:
         """Return scheme 1, of order 1, evaluated at (q_k, S_k): explicit for quadratic kinetic energy, linear friction.
 
-        ``retraction`` has the curves on a manifold.
+        On a manifold ``retraction`` determines the curves between successive points.
         """
         return cls("verlet", retraction=retraction)
 
@@ -117,7 +117,7 @@ class VariationalIntegrator(OneStepMethod):
     def midpoint(cls, alpha: float = 0.5, retraction: str | mf.Retraction | None = None) -> VariationalIntegrator:
         """Return the integrator that evaluates L at a fraction alpha of the step: of order 2 for alpha = 1/2, else 1.
 
-        ``retraction`` has the curves on a manifold.
+        On a manifold ``retraction`` determines the curves between successive points.
         """
         return cls(FiniteDifference(alpha), retraction=retraction)
 
@@ -125,7 +125,7 @@ class VariationalIntegrator(OneStepMethod):
     def symmetrised(cls, retraction: str | mf.Retraction | None = None) -> VariationalIntegrator:
         """Return scheme 3, of order 2, which takes the mean of the values at both ends.
 
-        ``retraction`` has the curves on a manifold.
+        On a manifold ``retraction`` determines the curves between successive points.
         """
         return cls("symmetrised", retraction=retraction)
 

@@ -17,7 +17,7 @@ from mpl_toolkits.mplot3d import Axes3D
 from ...errors import InputError
 from ...functions.gradients import EPS
 from ...systems import System
-from ...systems.invariants import recorded_invariants
+from ...systems.invariants import recorded_functions_with_verdicts
 from ..audit import LAW_FAILURE_VERDICT, Audit
 from ..solution import Solution
 from .figures import BLUE, DPI, GREEN, GREY, ORANGE, RED, checked_figure_path, save_figure
@@ -237,7 +237,7 @@ def invariants(solution: Solution, system: System, path: str | os.PathLike | Non
     """
     path = checked_figure_path(path)
     functions: dict[str, Callable] = {"energy": system.energy}
-    functions |= {name: function for name, (function, _) in recorded_invariants(system).items()}
+    functions |= {name: function for name, (function, _) in recorded_functions_with_verdicts(system).items()}
     figure, ax = plt.subplots(figsize=(6.4, 3.6), dpi=DPI, layout="constrained")
     for i, (name, function) in enumerate(functions.items()):
         values = np.asarray(jax.vmap(lambda x, f=function: f(x))(jnp.asarray(solution.x)))

@@ -23,7 +23,7 @@ from scipy.ndimage import map_coordinates
 
 from ...errors import InputError
 from ...systems import QuantumSystem, System
-from ...systems.invariants import recorded_invariants
+from ...systems.invariants import recorded_functions_with_verdicts
 from ..solution import Solution
 from .figures import BLUE, DPI, GREY, ORANGE, RED, checked_figure_path, save_figure
 
@@ -159,7 +159,7 @@ def _conserved_and_changing(solution: Solution, system: System | None) -> tuple[
         # the entropy of baths is no function of the body
         body_entropy = system.entropy if system.body_dim == system.dim else None
         function = body_entropy or next(
-            (J for J, is_conserved in recorded_invariants(system).values() if is_conserved), None
+            (J for J, is_conserved in recorded_functions_with_verdicts(system).values() if is_conserved), None
         )
         entropy = None if function is None else _vectorize_in_blocks(_restrict_to_body(function, system))
     else:

@@ -225,7 +225,7 @@ class Membrane(Module):
 
     def __init__(self, first, second, permeability, species: int | tuple[int, int] = 0, carries: float = 0.0):
         self.first, self.second = first, second
-        self.permeability = _check_coefficient(permeability, "the permeability of a membrane")
+        self.permeability = _checked_coefficient(permeability, "the permeability of a membrane")
         pair = (species, species) if isinstance(species, int) else species
         if not (isinstance(pair, tuple) and len(pair) == 2 and all(type(kind) is int for kind in pair)):
             raise InputError(f"the species of a membrane must be an integer or a pair of integers, got {species!r}")
@@ -245,7 +245,7 @@ class Membrane(Module):
             stoichiometry[_particle_index(body, kind, names, structure.particle_indices)] = sign
             sides[:, body] = 0.5, sign
         numbers, heat_shares, entropy_transport = (tuple(row.tolist()) for row in (stoichiometry, *sides))
-        L = _check_state_function(self.permeability, structure.dim, "the permeability of a membrane")
+        L = _checked_state_function(self.permeability, structure.dim, "the permeability of a membrane")
         return Process(numbers, heat_shares, entropy_transport, self.carries, L)
 
 
@@ -269,7 +269,7 @@ class Reaction(Module):
     rate: jax.Array | Callable
 
     def __init__(self, body, stoichiometry: Sequence[float], rate):
-        self.body, self.rate = body, _check_coefficient(rate, "the rate of a reaction")
+        self.body, self.rate = body, _checked_coefficient(rate, "the rate of a reaction")
         numbers = checked_numbers(stoichiometry, "the stoichiometry of a reaction")
         if numbers.ndim != 1 or not (np.isfinite(numbers).all() and np.any(numbers)):
             raise InputError(f"the stoichiometry of a reaction must be a row of finite numbers, got {numbers.tolist()}")
@@ -288,11 +288,11 @@ class Reaction(Module):
         stoichiometry, heat_shares = np.zeros(len(matter.N)), np.zeros(len(names))
         stoichiometry[indices], heat_shares[body] = self.stoichiometry, 1.0
         no_transport = (0.0,) * len(names)
-        L = _check_state_function(self.rate, structure.dim, "the rate of a reaction")
+        L = _checked_state_function(self.rate, structure.dim, "the rate of a reaction")
         return Process(tuple(stoichiometry.tolist()), tuple(heat_shares.tolist()), no_transport, jnp.zeros(()), L)
 
 
-def _check_coefficient(coefficient, what: str) -> jax.Array | Callable:
+def _checked_coefficient(coefficient, what: str) -> jax.Array | Callable:
     if callable(coefficient):
         return coefficient
     value = checked_numbers(coefficient, what, ())
@@ -300,7 +300,7 @@ def _check_coefficient(coefficient, what: str) -> jax.Array | Callable:
     return value
 
 
-def _check_state_function(coefficient, dim: int, what: str) -> jax.Array | Callable:
+def _checked_state_function(coefficient, dim: int, what: str) -> jax.Array | Callable:
     """Return a coefficient; a function is checked on states of shape (dim,)."""
     if not callable(coefficient):
         return coefficient

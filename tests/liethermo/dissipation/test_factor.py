@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.dissipation.noise import factor_divergences, terms_with_factors
+from liethermo.dissipation.noise import factor_divergences, noisy_terms_with_factors
 from liethermo.models.gases import gas_piston_state
 from liethermo.systems.spins import reorder_spins
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
@@ -29,7 +29,7 @@ CASES_WITH_FACTOR = [
 def measure_factors(system, x, dH, dS, dL):
     """Return the relative residual of ``B B^T = K``, ``B^T dH``, and the divergences less those by differentiation."""
     terms, conserves_energy = (
-        terms_with_factors(system.dissipation, system, x, dH, dL),
+        noisy_terms_with_factors(system.dissipation, system, x, dH, dL),
         system.dissipation.energy_law == "conserved",
     )
     covector = dS if conserves_energy else -dH
@@ -40,7 +40,7 @@ def measure_factors(system, x, dH, dS, dL):
     )
 
     def matrix(y):
-        terms_at_y = terms_with_factors(
+        terms_at_y = noisy_terms_with_factors(
             system.dissipation, system, y, system.energy.gradient(y), [L.gradient(y) for L in system.preserved]
         )
         return jnp.concatenate([jax.vmap(B.times)(jnp.eye(B.size)) for _, B in terms_at_y])
@@ -76,7 +76,7 @@ def test_factors_between_bodies():
     x = jnp.asarray(gas_piston_state(0.4, (310.0, 290.0, 300.0), p=0.3))
     rng = np.random.default_rng(0)
     dH = system.energy.gradient(x) * (1.0 + 0.01 * rng.standard_normal(5))
-    terms = terms_with_factors(system.dissipation, system, x, dH, ())
+    terms = noisy_terms_with_factors(system.dissipation, system, x, dH, ())
     assert sum(B.size for _, B in terms) == 3
     dS = rng.standard_normal(5)
     product = sum(B.times(B.transpose_times(dS)) for _, B in terms)
@@ -88,7 +88,7 @@ def test_a_dissipation_without_a_factor():
     system = build(mf.so(3), next(case for case in DISSIPATIONS if case.name == "force"))
     x = jnp.ones(3)
     with pytest.raises(lt.InputError, match=r"EulerPoincareForce gives no factor"):
-        terms_with_factors(system.dissipation, system, x, x, ())
+        noisy_terms_with_factors(system.dissipation, system, x, x, ())
     pairs = np.zeros((3, 3, 3, 3))
     for i, j, sign in ((0, 1, 1.0), (0, 2, -0.5)):
         for a, b in ((i, j), (j, i)):

@@ -1,11 +1,13 @@
 """Trees of jointed bodies beside Newton's and Euler's equations with constraints, closed forms, and bad input."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 import liethermo as lt
+from liethermo.engines.select_engine import is_worth_compiling
 from tests.liethermo.models.newton_euler import Body, final_state
 
 TENSOR = np.diag([3.0, 2.0, 1.5]) + 0.1
@@ -373,3 +375,62 @@ def test_a_control_without_the_change_of_inertia_fails(reference):
 
     run = solve_ivp(frozen, (0.0, 5.0), np.concatenate([momentum, np.eye(3).ravel()]), "DOP853", rtol=1e-9)
     assert np.abs(run.y[3:, -1].reshape(3, 3) - reference[0]).max() > 0.1
+
+
+@pytest.mark.parametrize("parents", [range(8), (0, 0, 1, 1, 3, 4, 4, 0)], ids=["chain", "branches"])
+def test_larger_trees_beside_derivatives_of_the_places_of_their_bodies(parents):
+    """``M = sum m D r^T D r + D w^T J D w`` less the linear momentum, r and w of each body from link to link."""
+    rng = np.random.default_rng(3)
+    tree, bodies = lt.bodies.Tree(), []
+    for i, parent in enumerate([None, *parents]):
+        mass, centre, moments = 1.0 + rng.random(), rng.normal(size=3), 1.0 + rng.random(3)
+        axis, place = rng.normal(size=3), rng.normal(size=3)
+        kind = lt.bodies.Slider if i % 3 == 2 else lt.bodies.Hinge
+        joint = {} if parent is None else {"parent": f"body {parent}", "joint": kind(at=place, axis=axis)}
+        tree.add(f"body {i}", mass, centre, moments, **joint)
+        bodies.append((mass, centre, np.diag(moments), axis / np.linalg.norm(axis), place, parent, i % 3 == 2))
+    q = rng.normal(size=len(parents))
+
+    def places_and_rotations(velocities, time):
+        """Return centres and rotations of all bodies after a time, the base turning by ``velocities[:3]``."""
+        turn, joints = velocities[:3] * time, q + velocities[3:] * time
+        rotations, origins, centres = [], [], []
+        for i, (_, centre, _, axis, place, parent, slides) in enumerate(bodies):
+            if parent is None:
+                R, origin = jax.scipy.linalg.expm(jnp.cross(turn, -jnp.eye(3))), jnp.zeros(3)
+            else:
+                R, origin = rotations[parent], origins[parent] + rotations[parent] @ place
+                step = joints[i - 1] * axis
+                if slides:
+                    origin = origin + R @ step
+                else:
+                    R = R @ jax.scipy.linalg.expm(jnp.cross(step, -jnp.eye(3)))
+            rotations.append(R)
+            origins.append(origin)
+            centres.append(origin + R @ centre)
+        return jnp.stack(centres), jnp.stack(rotations)
+
+    def kinetic_energy(velocities):
+        (_, R), (v, rates) = jax.jvp(lambda t: places_and_rotations(velocities, t), (0.0,), (1.0,))
+        masses = np.array([body[0] for body in bodies])
+        v = v - masses @ v / masses.sum()  # no linear momentum
+        spin = jnp.swapaxes(R, 1, 2) @ rates
+        omega = jnp.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
+        inertias = np.stack([body[2] for body in bodies])
+        return 0.5 * (masses @ jnp.sum(v**2, axis=1) + jnp.einsum("ni,nij,nj", omega, inertias, omega))
+
+    M = jax.hessian(kinetic_energy)(jnp.zeros(3 + len(parents)))
+    np.testing.assert_allclose(tree.system().mass_matrix(q), M, atol=1e-13 * float(jnp.abs(M).max()))
+
+
+def test_larger_trees_are_compiled_for_explicit_methods_alone():
+    """Newton's method of such a tree takes minutes to compile, and an explicit step never needs it."""
+    tree = lt.bodies.Tree()
+    tree.add("link 0", mass=5.0, inertia=(2.0, 1.5, 1.0))
+    for i in range(6):
+        hinge = lt.bodies.Hinge(at=(0.4, 0.0, 0.1), axis=np.eye(3)[i % 3], stiffness=0.5)
+        tree.add(f"link {i + 1}", 1.0, (0.2, 0.05, 0.0), (0.05, 0.06, 0.07), parent=f"link {i}", joint=hinge)
+    system = tree.system()
+    assert is_worth_compiling(system, lt.MetriplecticRungeKutta(4))
+    assert not is_worth_compiling(system, lt.MetriplecticGauss(2))
+    assert is_worth_compiling(tree_of(BODIES, NAMES).system(), lt.MetriplecticGauss(2))

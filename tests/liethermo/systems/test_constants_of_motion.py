@@ -10,7 +10,7 @@ import manifolds as mf
 from liethermo.systems.invariants import (
     conserves,
     preserved_names,
-    recorded_invariants,
+    recorded_functions_with_verdicts,
     resolve_invariants_near,
     undecided_functions,
 )
@@ -66,7 +66,7 @@ def test_unknown_is_a_row_of_its_own():
     system = lt.LiePoissonSystem(mf.so(3), lambda m: 0.5 * m[2], lambda m: jnp.log(m[0] - 1e6), Half(), validate=False)
     (name,) = system.casimirs()
     assert undecided_functions(system) == {name}
-    assert recorded_invariants(system)[name][1] is None
+    assert recorded_functions_with_verdicts(system)[name][1] is None
     assert resolve_invariants_near(system, np.array([2e6, 1.0, 1.0])).first_integrals() == {name}
 
 

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 import liethermo as lt
 from liethermo.dissipation.bodies import Process, conserved_number_combinations
 from liethermo.models.gases import porous_piston_state
-from liethermo.systems.invariants import recorded_invariants
+from liethermo.systems.invariants import recorded_functions_with_verdicts
 from tests.refusals import refusal_test
 
 piston, vessel = functools.cache(lt.models.porous_piston), functools.cache(lt.models.reaction_vessel)
@@ -84,10 +84,10 @@ def test_the_law_of_mass_action():
     assert end[3] / (end[1] * end[2]) == pytest.approx(
         float(GAS.equilibrium_constant(T[0], (-1.0, -1.0, 1.0))), rel=1e-12
     )
-    for name, (C, kept) in recorded_invariants(vessel()).items():
+    for name, (C, kept) in recorded_functions_with_verdicts(vessel()).items():
         assert kept, name
         assert np.ptp(np.asarray(C(run.x))) < 1e-14
-    assert len(recorded_invariants(vessel())) == 2  # A + C and B + C
+    assert len(recorded_functions_with_verdicts(vessel())) == 2  # A + C and B + C
     assert abs(end[3] - 0.1) > 0.1
 
 

@@ -416,7 +416,7 @@ REFUSED_CALLS = [
     (lambda: small_lattice(bath=np.array([0, 0, 1])), "a dissipation heats bath 1, but there are 1 baths"),
     (lambda: small_lattice(bath=np.array([0, 0])), "of the shape .3,. of the sites"),
     (lambda: lt.HeatBaths(-1.0), r"must be positive, not \[-1.0\]"),
-    (lambda: lt.HeatBaths([1.0, 2.0]), r"1 baths is one number, or has shape \(1,\)"),
+    (lambda: lt.HeatBaths([1.0, 2.0], number=1), r"1 baths is one number, or has shape \(1,\)"),
     (lambda: small_lattice(baths=2.0), "baths must be lt.HeatBaths, True"),
     (
         lambda: lt.LiePoissonSystem(mf.so(3), lambda s: s[0] ** 2, dissipation=lt.LandauLifshitz()),
@@ -439,19 +439,20 @@ def test_ratios_and_sites_of_the_structure_are_checked():
 
 
 class IteratedRotation(lt.SpinSystem):
-    """Control: what noise turns is left to the iteration."""
+    """Control: what turns the spins is left to the iteration."""
 
-    def solve_at_spins(self, x, dH, noise_rates, half_step, velocities):
-        return sum(velocities)
+    def solve_at_spins(self, *arguments):
+        return None
 
 
 class NoiseAlone(lt.SpinSystem):
     """Control: only the turn by noise is solved for at once."""
 
-    def solve_at_spins(self, x, dH, noise_rates, half_step, velocities):
-        a, v = half_step * noise_rates, sum(velocities)
-        matrices = jnp.eye(3) - jnp.stack([jnp.cross(a, e) for e in np.eye(3)], axis=-1)
-        return jnp.append(jnp.linalg.solve(matrices, v[:-1].reshape(-1, 3, 1)), v[-1])
+    def solve_at_spins(self, x, dH, dS, noise_rates, others, half_step, k):
+        slopes = super().solve_at_spins(x, dH, dS, noise_rates, others, 0.0, k)
+        matrices = jnp.eye(3) - jnp.stack([jnp.cross(half_step * noise_rates, e) for e in np.eye(3)], axis=-1)
+        residuals = (slopes - k)[:-1].reshape(-1, 3, 1)
+        return jnp.append(k[:-1] + jnp.linalg.solve(matrices, residuals).ravel(), slopes[-1])
 
 
 class Unsaid(lt.LandauLifshitz):
@@ -493,14 +494,37 @@ def test_precession_and_damping_of_each_spin_are_solved_for_at_once(step, needs_
         assert 1.2 * at_once.stats.fixed_point_iterations < control.stats.fixed_point_iterations
 
 
+def test_spins_with_torque_power_and_two_baths_move_as_the_iteration_alone_says():
+    sites, runs = (3, 2), []
+    for kind in (lt.SpinSystem, IteratedRotation):
+        system = kind(
+            sites,
+            lt.magnetism.exchange(sites, 1.0),
+            [lt.LandauLifshitz(0.5, bath=np.arange(6).reshape(sites) % 2), lt.BathConduction([[0.0, 0.3], [0.3, 0.0]])],
+            lt.HeatBaths(5.0, number=2),
+            torque=lambda t, s: jnp.stack([jnp.sin(3.0 * t), 0.0 * t, 0.2 + 0.0 * t]),
+            power=lambda t: jnp.exp(-t),
+        )
+        start = system.state(unit(*sites))
+        runs.append(lt.integrate(system, start, (0.0, 0.5), 0.02, noise=lt.Fluctuations(0.2, 3), engine="array"))
+    at_once, control = runs
+    assert at_once.audit().passed
+    assert np.abs(at_once.x - control.x).max() < 1e-13
+    assert at_once.stats.fixed_point_iterations < control.stats.fixed_point_iterations
+
+
 def test_equations_of_each_spin_have_the_derivative_of_its_velocity():
     """Compared with the derivative of the vector field of one spin, less the part that changes its length."""
     spin = lt.SpinSystem(1, lt.magnetism.zeeman(1, [0.3, 0.5, 1.0]), lt.LandauLifshitz(0.7), ratio=1.3)
     s, v, w = unit(1).ravel(), *RANDOM.standard_normal((2, 3))
     dH, h = np.array([-0.3, -0.5, -1.0]), 0.2
-    u = np.asarray(spin.solve_at_spins(s, dH, w[None], h, [v]))
+    slopes, k = (
+        spin.solve_at_spins(s, dH, np.zeros(3), w[None], np.zeros(3), h, v),
+        spin.vector_field(s) + np.cross(w, s),
+    )
+    u = np.asarray(slopes) - v
     derivative = jax.jvp(lambda s: spin.vector_field(s) + jnp.cross(w, s), (s,), (u,))[1] + 0.7 * dH * (s @ u)
-    assert np.abs(u - h * np.asarray(derivative) - v).max() < 1e-14
+    assert np.abs(u - h * np.asarray(derivative) - (k - v)).max() < 1e-14
 
 
 FIELDS = np.array([0.5, 2.0, 5.0])

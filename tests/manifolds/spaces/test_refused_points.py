@@ -1,4 +1,4 @@
-"""What spaces refuse: points and vectors off the space, the cut locus, and arrays of the wrong kind."""
+"""Refusals of spaces: points and vectors off the space, the cut locus, and arrays of the wrong kind."""
 
 import numpy as np
 import pytest
