@@ -140,7 +140,7 @@ class ArticulatedBodies(Module):
     # -- which joints move what: constants of the tree ----------------------------------------------------------------
 
     @property
-    def _moved_by(self) -> np.ndarray:
+    def _is_moved_by(self) -> np.ndarray:
         """Truth of "joint j moves link i", shape (k + 1, k)."""
         moved_by = np.zeros((self.n_joints + 1, self.n_joints), bool)
         for i, parent in enumerate(self.parents):
@@ -152,7 +152,7 @@ class ArticulatedBodies(Module):
     def _bodies_beyond(self) -> np.ndarray:
         """Matrix that sums over the bodies that move with each link, shape (k + 1, m); those of the base are all."""
         links = np.array(self.body_links)
-        return np.concatenate([np.ones((1, len(links))), self._moved_by[links].T])
+        return np.concatenate([np.ones((1, len(links))), self._is_moved_by[links].T])
 
     @property
     def _n_base_screws(self) -> int:
@@ -216,7 +216,7 @@ class ArticulatedBodies(Module):
         b = self._n_base_screws
         links = np.array([0] * b + list(range(1, self.n_joints + 1)))
         momenta = SpatialInertias(*(part[links] for part in composites)).momentum(screws)
-        is_below = np.pad(self._moved_by[1:], ((b, 0), (b, 0)))  # (i, j): screw j is i or moves all that i moves
+        is_below = np.pad(self._is_moved_by[1:], ((b, 0), (b, 0)))  # (i, j): screw j is i or moves all that i moves
         is_below[:, :b] = np.tri(b + self.n_joints, b, dtype=bool)
         entries = jnp.where(is_below, momenta @ screws.T, 0.0)
         return entries + jnp.where(is_below & ~np.eye(len(links), dtype=bool), entries, 0.0).T
@@ -279,7 +279,7 @@ class ArticulatedBodies(Module):
         composites, screws = self.composite_inertias(poses), self.screws(poses)
         steps = _eliminate_velocities(self._inertia_matrix(screws, composites), self._momenta(Pi, p))
         rates = _velocities(steps)
-        moves = np.concatenate([np.ones((self.n_joints + 1, b)), self._moved_by], axis=1)
+        moves = np.concatenate([np.ones((self.n_joints + 1, b)), self._is_moved_by], axis=1)
         velocities = moves @ (rates[:, None] * screws)
         momenta = self._bodies_beyond[1:] @ self._body_momenta(poses, velocities[np.array(self.body_links)])
         gradient = jnp.sum(momenta * _motion_cross(poses.joint_screws, velocities[1:]), axis=1)
@@ -490,7 +490,7 @@ def _weight_potential(weight: WeightPotential, x) -> jax.Array:
 def _weight_rounding_scale(weight: WeightPotential, x) -> jax.Array:
     mechanism, q = weight.mechanism, x[: weight.mechanism.n_joints]
     strokes = jnp.where(np.array(mechanism.slides), jnp.abs(q), 0.0)
-    lengths = mechanism._moved_by @ (jnp.linalg.norm(mechanism.places, axis=1) + strokes)
+    lengths = mechanism._is_moved_by @ (jnp.linalg.norm(mechanism.places, axis=1) + strokes)
     arms = lengths[np.array(mechanism.body_links)] + jnp.linalg.norm(mechanism.centres, axis=1)
     return jnp.linalg.norm(weight.gravity) * jnp.dot(mechanism.masses, arms)
 
