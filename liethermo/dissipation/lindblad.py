@@ -90,6 +90,10 @@ class LindbladJumps(Dissipation):
         >>> jumps = lt.LindbladJumps.from_collapse_operators([np.sqrt(0.2) * lower])
         >>> qubit = lt.QuantumSystem(np.diag([0.0, 1.0]), jumps)
         """
+        if isinstance(operators, np.ndarray) and operators.ndim == 2:
+            raise InputError(
+                f"collapse operators must be a list, such as [V], got one array of shape {operators.shape}"
+            )
         couplings = []
         for i, operator in enumerate(operators):
             is_pair = isinstance(operator, list | tuple) and len(operator) == 2 and np.ndim(operator[0]) != 1

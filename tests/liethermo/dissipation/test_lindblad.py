@@ -231,6 +231,8 @@ def test_collapse_operators_contain_their_rates():
     np.testing.assert_allclose(system.vector_field(x, 2.0), same.vector_field(x), atol=1e-15)
     with pytest.raises(lt.InputError, match=r"string 'sqrt\(t\)', which is not evaluated"):
         lt.LindbladJumps.from_collapse_operators([[LOWER, "sqrt(t)"]])
+    with pytest.raises(lt.InputError, match=r"such as \[V\]"):
+        lt.LindbladJumps.from_collapse_operators(LOWER)
 
 
 def test_a_function_that_returns_operators_is_refused():

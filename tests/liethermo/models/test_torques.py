@@ -334,7 +334,7 @@ def test_tables_are_scipys_splines(m):
 test_bad_torques_are_refused = refusal_test(
     (lambda: T.Tabulated(lambda t: t), "kind='cubic'"),
     (lambda: T.Tabulated([0.0, 1.0]), "spline of SciPy alone"),
-    (lambda: T.Tabulated(SPLINE, MOMENTS), "spline was given"),
+    (lambda: T.Tabulated(SPLINE, MOMENTS), "a spline has its values"),
     (lambda: T.Tabulated(NODES, MOMENTS, kind="quadratic"), "kind must be"),
     (lambda: T.Tabulated(scipy.interpolate.CubicSpline(NODES, MOMENTS.T, axis=1)), "axis 0"),
     (lambda: lt.models.free_rigid_body(attitude=True, torque=SPLINE), r"Tabulated\(spline\)"),
