@@ -170,12 +170,9 @@ def dot_vectors(u: VectorComponents, v: VectorComponents) -> jax.Array:
 
 
 def sum_of_dots(u: VectorComponents, v: VectorComponents) -> jax.Array:
-    """Return ``sum u_i . v_i`` over all vectors, by ``jnp.dot``, which is faster than a sum over the expression of
-    v."""
-    return sum(
-        (jnp.dot(jnp.broadcast_to(a, b.shape).reshape(-1), b.reshape(-1)) for a, b in zip(u, v, strict=True)),
-        jnp.zeros(()),
-    )
+    """Return ``sum u_i . v_i`` over all vectors."""
+    # without the barrier, the sum would evaluate the expression of v in a loop that has no vector instructions
+    return jnp.sum(jax.lax.optimization_barrier(dot_vectors(u, v).reshape(-1)))
 
 
 def reshape_vectors(vectors: VectorComponents, shape: tuple[int, ...]) -> VectorComponents:

@@ -293,3 +293,16 @@ def test_a_second_process_computes_the_same_bits(tmp_path):
         files.append(sorted(file.name for file in (tmp_path / "cache").glob("*.xla")))
     assert outputs[0] == outputs[1]
     assert files[0] == files[1] != []
+
+
+def test_optimisation_barriers_hold_in_programs_on_the_cpu():
+    """The control is a program with the default options, in which XLA computes the sine in the loop that joins."""
+
+    def join_powers(x):
+        y = jax.lax.optimization_barrier(jnp.sin(x))
+        return jnp.concatenate([y, y * y])
+
+    lowered = jax.jit(join_powers).lower(jnp.ones(100))
+    with_barrier, control = (lowered.compile(options).as_text() for options in (programs.LOOP_XLA_OPTIONS, None))
+    assert "opt-barrier" in with_barrier
+    assert "opt-barrier" not in control
