@@ -140,11 +140,33 @@ TORQUE_FREE_LAWS = TorqueLaws()
 """Laws of a system on which no torque acts."""
 
 
+REPLACED_MEMBERS = {
+    "outside": "domain",
+    "domain_margin": "domain",
+    "why_singular": "domain",
+    "torque_name": "torque_laws",
+    "has_impulse": "torque_laws",
+    "torque_invariant_casimirs": "torque_laws",
+    "needs_attitude": "torque_laws",
+    "torque_entropy_law": "torque_laws",
+    "has_all_casimirs": "orbit_levels",
+    "sparsity_pattern": "sparse_newton",
+    "residual_weights": "sparse_newton",
+    "velocity_functions": "motion_quantities",
+}
+"""Names of members that kinds of systems used to override, and of those that replace them."""
+
+
 class SystemInterface(Geometry):
     """Data of a kind of system, and methods that a subclass may override.
 
     :class:`System` derives everything else from them, and documents the attributes.
     """
+
+    def __init_subclass__(cls, **options):
+        super().__init_subclass__(**options)
+        for name in REPLACED_MEMBERS.keys() & cls.__dict__.keys():
+            raise TypeError(f"{cls.__name__} defines {name}, which nothing calls. Override {REPLACED_MEMBERS[name]}")
 
     entropy: Energy | None
     dissipation: Dissipation | None
@@ -220,6 +242,10 @@ class SystemInterface(Geometry):
     def domain(self) -> Domain:
         """Conditions that a state must satisfy beside finite components, with functions that explain them."""
         return Domain()
+
+    def outside(self, x) -> str:
+        """Return why the state x, shape (n,), is outside the :attr:`domain`; "" if it is inside."""
+        return self.domain.why_outside(x)
 
     def run_conditions(self, x: np.ndarray, t: np.ndarray, guarantees: frozenset[str]) -> tuple[RunCondition, ...]:
         """Return conditions of a run beside its laws, such as positive density matrices, for the rows of an audit.

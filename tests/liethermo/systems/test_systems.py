@@ -334,6 +334,14 @@ class UnstartableOnASpace(lt.MetriplecticSystem):
     domain = Unstartable.domain
 
 
+def test_members_that_are_not_called_any_more_are_refused():
+    """A kind of system of an earlier version, whose own ``outside`` would not be asked."""
+    with pytest.raises(TypeError, match=r"Earlier defines outside, which nothing calls\. Override domain"):
+        type("Earlier", (lt.MetriplecticSystem,), {"outside": lambda self, x: "too hot"})
+    kind = type("Kind", (lt.MetriplecticSystem,), {"domain": Domain(why_outside=lambda x: "too hot")})
+    assert kind(None, lambda x: x[0] ** 2, dim=1).outside(jnp.ones(1)) == "too hot"
+
+
 def test_what_a_system_says_of_first_states_is_heard_through_what_it_is_run_as():
     """Beside an attitude, in the space around a manifold, and with a clock."""
     energy, entropy = lt.Quadratic([1.0, 1 / 2, 1 / 3]), lt.Quadratic(np.ones(3))
