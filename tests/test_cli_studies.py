@@ -100,7 +100,7 @@ def refusals(folder, *parts, changes=()):
         ("axes.rate = {first = 0.0, last = 1.0, point = 3}", "study.axes.rate.first: no such key"),
         ("axes.rate = {points = 3}", "study.axes.rate.first is missing"),
         ('axes.s = {zip = {rate = [1.0], "inertia[0]" = [1.0, 2.0]}}', "study.axes.s: parameters that vary together"),
-        ("axes.s = {sobol = 4}", "study.axes.s: a sample needs the ranges"),
+        ("axes.s = {sobol = 4}", "study.axes.s: a sample needs at least one range"),
         ("axes.s = {seed = 4}", "study.axes.s: must have one of zip"),
         (
             "axes.rate = [1.0]\nmeasure = {m = {relaxed = -1.0}}",

@@ -257,7 +257,7 @@ def _body_component_indices(indices: StateIndices, momentum_numbers: np.ndarray)
 
 
 def _momentum_and_edge_numbers(first_bodies: Indices, second_bodies: Indices, indices: StateIndices):
-    """Return three index arrays, an entry for each edge and component: first momentum, second momentum, edge."""
+    """Return for each edge and component the indices of the momenta at its two ends and of the edge, three arrays."""
     i, j = np.asarray(first_bodies), np.asarray(second_bodies)
     starts = np.searchsorted(indices.owner, np.arange(len(indices.S)))
     counts = np.bincount(indices.owner, minlength=len(indices.S))[i]

@@ -34,7 +34,7 @@ class Operator(StaticArray):
 
 
 def get_density_structure(system: Geometry, name: str) -> mf.DensityMatrices:
-    """Return the structure of a system of density matrices; InputError for other systems."""
+    """Return the map between density matrices and state vectors of a quantum system; InputError for other systems."""
     structure = system.poisson.first if isinstance(system.poisson, ProductPoisson) else system.poisson
     if not isinstance(structure, mf.DensityMatrices):
         raise InputError(f"{name} needs density matrices. Use it in an lt.QuantumSystem")

@@ -118,7 +118,7 @@ class ThermalJumps(Dissipation):
         if not pairs or not all(isinstance(pair, tuple | list) and len(pair) == 2 for pair in pairs):
             raise InputError("couplings must be a list of pairs (V, rate), such as [(V, 0.1)]")
         if isinstance(bath, bool) or not isinstance(bath, int) or bath < 0:
-            raise InputError(f"bath must be the number of a bath, from 0, got {bath!r}")
+            raise InputError(f"bath must be the index of a bath, an integer >= 0, got {bath!r}")
         self.operators = tuple(
             Operator(checked_square_matrix(V, f"the coupling V[{i}]")) for i, (V, _) in enumerate(pairs)
         )
@@ -328,7 +328,8 @@ class ThermalJumps(Dissipation):
         return rate + jnp.sum(((1.0 - np.eye(size)) * H.conj() * drho).real)
 
     def _weighted_jump_rates(self, system, omega, T) -> jax.Array:
-        """Return the rate of each jump at its omega and T, times its weight, shape (jumps,)."""
+        """Return the rate of each jump at its transition frequency and the temperature of its bath, times its
+        weight, shape (jumps,)."""
         return jnp.stack(
             [
                 jump.weight * self._rate_at(jump.coupling_index, omega[i], T, system.time)

@@ -270,7 +270,7 @@ def apply_event_detection(
             status,
         )
     initial_bracket = root_bracket.bracket_from_step(
-        h, *root_bracket.first_event_ends(control.event_directions, values_before, values)
+        h, *root_bracket.first_event_values_at_step_ends(control.event_directions, values_before, values)
     )
     end_values = jnp.where(ends_at_start, values_before, jnp.where(time_advances, signed_values, 0.0))
     updated_search = jnp.where(

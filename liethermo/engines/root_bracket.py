@@ -73,7 +73,9 @@ def first_event_value(directions: tuple[int, ...], values_before, values) -> jax
     return jnp.min(jnp.where(can_cross, values / scale, 1.0))
 
 
-def first_event_ends(directions: tuple[int, ...], values_before, values_after) -> tuple[jax.Array, jax.Array]:
+def first_event_values_at_step_ends(
+    directions: tuple[int, ...], values_before, values_after
+) -> tuple[jax.Array, jax.Array]:
     """Return :func:`first_event_value` at the start and at the end of a step in which an event happens.
 
     Functions that are NaN at the end are left out.

@@ -87,7 +87,7 @@ def checked_energy(energy: Energy, dim: int, role: str, allow_time: bool = False
 
 
 def trace_energies(tree, dim: int, role: str | None = None):
-    """Return a pytree with its energies checked by :func:`checked_energy`; an energy that occurs twice stays one
+    """Return a pytree with each energy checked and traced; an energy that occurs twice is traced once and stays one
     object.
 
     Without a role, an energy that fails the check is left unchanged.

@@ -157,7 +157,8 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
 
 
 def _noise_amplitude(B: Factor, thermal_energy, h) -> jax.Array:
-    """Return the factor of the noise increments, ``sqrt(2 k)`` or ``sqrt(2 k T)``, enlarged where they rotate spins.
+    """Return the factor of the Brownian increments, ``sqrt(2 k)`` or ``sqrt(2 k T)``, corrected where noise rotates
+    spins.
 
     A midpoint step with the angles w rotates a spin by ``2 atan(|w| / 2)``, less than |w|, and its friction is smaller
     too. In a weak field the spin then has the temperature of exact noise of variance ``s (1 - s / 4 + 3 s^2 / 8 -

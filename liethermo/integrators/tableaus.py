@@ -158,7 +158,7 @@ LOBATTO_ORDERS = (4, 6, 8)
 
 
 @functools.cache
-def lobatto_rule(nodes: int) -> tuple[np.ndarray, np.ndarray]:
+def lobatto_nodes_and_weights(nodes: int) -> tuple[np.ndarray, np.ndarray]:
     """Return nodes (with both ends) and weights on [0, 1]: exact to degree ``2 nodes - 3``, all weights positive."""
     m = nodes - 1  # the inner nodes are the roots of P_m'
     x = np.polynomial.legendre.Legendre.basis(m).deriv().roots().astype(np.longdouble)

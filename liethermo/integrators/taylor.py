@@ -19,7 +19,7 @@ from ..tracing.taylor import TaylorSeriesError, check_taylor_series, increment_t
 from .base import OneStepMethod, register
 from .charts import resolve_retraction
 from .explicit import ExplicitMethod, StepRow, UncorrectedStep
-from .tableaus import lobatto_rule
+from .tableaus import lobatto_nodes_and_weights
 
 MIN_ORDER = 2
 """Lowest order of a Taylor method."""
@@ -105,7 +105,7 @@ class MetriplecticTaylor(ExplicitMethod):
 
     @property
     def _lobatto_rule(self) -> tuple[np.ndarray, np.ndarray]:
-        return lobatto_rule((self.order + 1) // 2 + 1)
+        return lobatto_nodes_and_weights((self.order + 1) // 2 + 1)
 
     def check(self, system: System) -> None:
         """Raise InputError unless there is a law to hold, ``preserve`` is conserved, and all functions are smooth."""
@@ -125,7 +125,7 @@ class MetriplecticTaylor(ExplicitMethod):
             self._check_chart_series(system.space)
 
     def _check_chart_series(self, space: mf.Space) -> None:
-        """Raise TaylorSeriesError unless the points of the chart have Taylor series."""
+        """Raise TaylorSeriesError unless the map from coordinates of the chart to states has a Taylor series."""
         assert self.retraction is not None
         chart = resolve_retraction(space, self.retraction).chart
         z = space.random(0)
@@ -164,7 +164,8 @@ class MetriplecticTaylor(ExplicitMethod):
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
         """Estimate the error from the residual of the polynomial X at its end: ``h |f(X(1)) - X'(1)| / (p + 1)``.
 
-        The first term left out of X' is p + 1 times that of X, so the estimate is right to a factor that tends to 1. It
+        At the end of a step the first neglected term of X' is p + 1 times that of X, so the ratio of estimate and
+        error tends to 1 with h. It
         also detects a condition (``jnp.where``) whose value has changed inside the step.
         """
         return h * jnp.max(jnp.abs(error_of_step(system, x, k[StepRow.ERROR], k[StepRow.MEAN_SLOPE])))

@@ -169,7 +169,8 @@ class DataScales(NamedTuple):
     time_scale: float
 
     def extend_to_states(self, indices: np.ndarray, states: np.ndarray) -> DataScales:
-        """Return the scales of full states: the data scales at ``indices``, those of ``states`` elsewhere.
+        """Return the scales of full states: those of the data at ``indices``, and those computed from ``states``
+        elsewhere.
 
         A component that does not vary has centre 0 and scale 1.
         """

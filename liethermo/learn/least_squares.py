@@ -169,7 +169,7 @@ def fit_by_least_squares(
         noise, units = new_noise, problem.units_for(new_noise)
         result = refine(result.weights, result.states, whole_runs, units, n_substeps)
     if levels is not None and noise is not None:
-        result = result._replace(residual=_residual_to_noise(noise, levels, n_observed))
+        result = result._replace(residual=_rms_residual_over_noise(noise, levels, n_observed))
     return LeastSquaresFit(result._replace(iterations=n_iterations), noise)
 
 
@@ -197,7 +197,7 @@ def _pieces_of_length(runs: PaddedRuns, length: int) -> list[Piece]:
     return pieces
 
 
-def _residual_to_noise(residuals: np.ndarray, levels: NoiseLevels, counts: np.ndarray) -> float:
+def _rms_residual_over_noise(residuals: np.ndarray, levels: NoiseLevels, counts: np.ndarray) -> float:
     """Return the root mean square of residuals over the noise estimated from the data; 1 if there is no estimate.
 
     Where the differences show no noise but bound it, residuals below the bound count as noise.

@@ -15,7 +15,12 @@ from manifolds._pytree_module import Module
 
 from ..errors import InputError
 from ..systems import EulerPoincareClosedSystem, LiePoissonSystem
-from ..systems.torque import MAX_ARGUMENTS_WITHOUT_ATTITUDE, checked_torque, evaluate_torque, torque_name
+from ..systems.torque import (
+    MAX_ARGUMENTS_WITHOUT_ATTITUDE,
+    evaluate_torque,
+    torque_name,
+    traced_torque_and_argument_counts,
+)
 from .inertia import checked_inertia
 from .parameters import checked_positive
 from .rotors import reaction_wheels
@@ -107,7 +112,7 @@ def body_with_wheels(
     algebra = mf.direct_sum(mf.so(3), mf.abelian(3))
     external = None
     if torque is not None:
-        torque, counts = checked_torque(torque, algebra, mf.SO(3))
+        torque, counts = traced_torque_and_argument_counts(torque, algebra, mf.SO(3))
         if max(counts) > MAX_ARGUMENTS_WITHOUT_ATTITUDE:
             raise InputError(
                 f"body_with_wheels follows no attitude, but its torque {torque_name(torque)} needs it. Give "

@@ -465,7 +465,7 @@ def _joint_motors(moved: list[_Body], given: Mapping[str, Any] | None, layout: _
             motor = checked_finite(np.atleast_1d(motor) if not is_traced(motor) else motor, what)
             if motor.shape not in allowed_shapes:
                 wanted = "one number" if size == 1 else f"an array of shape ({size},)"
-                raise FunctionError(f"{what} must give {wanted}, got shape {motor.shape}")
+                raise FunctionError(f"{what} must be {wanted}, got an array of shape {motor.shape}")
         functions.append(motor)
         indices.append(tuple(range(start, end)))
         driven.append(name)

@@ -303,7 +303,9 @@ class _MjcfReader:
         position = _numbers(element, "pos", 3, np.zeros(3))
         kinds = [kind for kind in MJCF_ORIENTATIONS if kind in element.attrib]
         if len(kinds) > 1:
-            raise InputError(f"{element.tag} must have one orientation, got {' and '.join(kinds)}")
+            raise InputError(
+                f"{element.tag} must have at most one attribute for its orientation, got {' and '.join(kinds)}"
+            )
         if not kinds:
             return np.eye(3), position
         if kinds[0] == "quat":

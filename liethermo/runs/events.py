@@ -257,7 +257,7 @@ def _checked_event_function(
         except TRACE_ERRORS as error:
             failure = failure or error
         else:
-            _check_is_number(value, name)
+            _check_result_is_scalar(value, name)
             return EventFunction(traced, names)
     assert failure is not None
     arguments = [np.asarray(a) for a in event_arguments(names, system, t, jnp.asarray(x))]
@@ -269,11 +269,11 @@ def _checked_event_function(
         raise FunctionError(trace_error_message(description, failure)) from error
     if result is None:
         raise FunctionError(trace_error_message(f"{name} could not be evaluated", failure))
-    _check_is_number(number, name)
+    _check_result_is_scalar(number, name)
     return EventFunction(PythonCall(call), names)
 
 
-def _check_is_number(value, name: str) -> None:
+def _check_result_is_scalar(value, name: str) -> None:
     shape = getattr(value, "shape", None)
     if shape != ():
         raise FunctionError(

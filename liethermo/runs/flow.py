@@ -322,7 +322,7 @@ def _compute_path(
     return_slopes: bool,
     final_only: bool,
 ) -> tuple[jax.Array, list]:
-    """Return the saved states and the last, or the last alone, computed with all numbers as program arguments.
+    """Return the saved states and the last, or the last alone, by a program that takes all parameters as arguments.
 
     With ``return_slopes`` also return, for each engine call, the state at the start of each step, its compensation, and
     the slopes that solve its equations.

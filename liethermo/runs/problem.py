@@ -105,7 +105,8 @@ class Problem:
     def engine(
         self, requested_engine: str, system: System, planned_steps: int, noise_increments: Callable | None = None
     ) -> EngineWithFallback:
-        """Return an engine for a run in this thread: a shared one, or a new one if it can serve one span or path only.
+        """Return an engine for a run in this thread: a shared one, or a new one if the run depends on its time span
+        or noise path.
 
         Parameters
         ----------

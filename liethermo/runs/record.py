@@ -209,7 +209,7 @@ class EnsembleRecord:
             reasons={**reasons, **self.failure_reasons},
             provenance={**provenance, "engine": engine},
             evidence_source=self._evidence_source(replay),
-            velocity_sources=self._velocity_functions_by_name(),
+            velocity_sources=self._velocity_getters_by_name(),
             solution_builder=self._build_solution,
             **quantities,
             **fields,
@@ -225,7 +225,7 @@ class EnsembleRecord:
         ]
         return lambda: merge_evidence([collect() for collect in collectors])
 
-    def _velocity_functions_by_name(self) -> dict[str, Callable[[], np.ndarray]]:
+    def _velocity_getters_by_name(self) -> dict[str, Callable[[], np.ndarray]]:
         """Return functions that compute the velocities of all trajectories, by the names of the velocities."""
         if self.x is None and self.trajectories is None:
             return {}

@@ -144,7 +144,7 @@ class StepSchedule:
         return StepSchedule((self.start, self.end), self.h, self.save_every, save_at, breaks=all_breaks)
 
     def ends_step_at(self, t: float) -> bool:
-        """Return whether a full step ends at a time inside the span, to rounding."""
+        """Return whether a time inside the span is a whole number of steps after its start, to rounding."""
         segment = next(segment for segment in self.segments if t <= segment.end)
         n_steps = round((t - segment.start) / self.h)
         rounding = TIME_TOLERANCE_ULPS * EPS * max(abs(self.start), abs(self.end))

@@ -89,8 +89,8 @@ def schedule_around_features(
 def undeclared_features(system: System, x: np.ndarray, schedule: StepSchedule) -> list[TimeFeature]:
     """Return the features of the energy and the torque of a prepared system that are not at declared breaks.
 
-    The gradient of the energy and the torque at the initial state are compared at times all over the span. A jump is
-    located to rounding.
+    The gradient of the energy and the torque at the initial state are compared at times all over the span. The time
+    of a jump is found up to its rounding error.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def undeclared_features(system: System, x: np.ndarray, schedule: StepSchedule) -
     if not np.isfinite(schedule.end) or n_intervals < MIN_SAMPLED_INTERVALS:
         return []
     times = np.linspace(schedule.start, schedule.end, n_intervals + 1)
-    values = _gradient_and_torque_at_times(system, x, times)
+    values = _gradient_and_torque_of_state_at_times(system, x, times)
     if not np.isfinite(values).all():
         return []
     scale = np.ptp(values, axis=0)
@@ -127,7 +127,7 @@ def undeclared_features(system: System, x: np.ndarray, schedule: StepSchedule) -
     return features
 
 
-def _gradient_and_torque_at_times(system: System, x: np.ndarray, times: np.ndarray) -> np.ndarray:
+def _gradient_and_torque_of_state_at_times(system: System, x: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Return the gradient of the energy and the torque at a state at several times, shape (times, values)."""
     driven = driven_system_or_none(system)
     assert driven is not None
@@ -140,7 +140,7 @@ def _locate_jump(system: System, x: np.ndarray, scale: np.ndarray, start: float,
     """Return the first time after a jump in an interval, or None if the functions change continuously there."""
     while True:
         times = np.unique(np.linspace(start, end, N_PARTS + 1))
-        values = _gradient_and_torque_at_times(system, x, times)
+        values = _gradient_and_torque_of_state_at_times(system, x, times)
         changes = (np.abs(np.diff(values, axis=0)) / scale).max(axis=1)
         part = int(np.argmax(changes))
         if not changes[part] > JUMP_FRACTION * change:

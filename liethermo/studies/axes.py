@@ -165,7 +165,7 @@ def sobol(count: int, *, seed: int, **ranges) -> Zipped:
 
 def _sample_from_ranges(draw_unit_sample, ranges: Mapping[str, Any]) -> Zipped:
     if not ranges:
-        raise InputError("a sample needs the ranges of parameters: rate=(0.1, 10.0, 'log')")
+        raise InputError("a sample needs at least one range of a parameter, such as rate=(0.1, 10.0, 'log')")
     for name, bounds in ranges.items():
         if not (
             isinstance(bounds, tuple | list) and len(bounds) in (2, 3) and bounds[2:] in ((), [], ("log",), ["log"])

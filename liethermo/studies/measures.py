@@ -193,7 +193,7 @@ def _describe_array(value: np.ndarray) -> str:
 
 
 def parse_measures_and_event(specification: Mapping[str, Any], until: Any) -> tuple[dict[str, Measure], Any]:
-    """Return the measures of a :class:`Study` by name, and the event at which its runs end.
+    """Return the quantities that a :class:`Study` computes of each run, by name, and the event that ends its runs.
 
     Raises
     ------

@@ -375,8 +375,8 @@ LOCK_ATTEMPTS = 5
 def _try_lock(file) -> bool:
     """Try to lock a file, and return True if that succeeded.
 
-    A process that asks whether a run is active (:func:`active_run_record`) holds the lock for a moment, hence several
-    attempts.
+    A process that asks whether a run is active (:func:`active_run_record`) holds the lock for a moment, so this
+    function tries several times.
     """
     for _ in range(LOCK_ATTEMPTS):
         try:

@@ -353,7 +353,7 @@ class Study(metaclass=ListedType):
     def _solve_example(
         self, axes: Axes | None = None, index: tuple[int, ...] = ()
     ) -> tuple[PointSolver, PointResults, np.ndarray]:
-        """Return the solver, the example's results and its initial state.
+        """Run one point of the study as an example; return its solver, its results and its initial state.
 
         The example is the point at ``index`` of the axes, or the first candidate that can be run.
         """

@@ -115,7 +115,7 @@ def _momentum_of_quadratic(energy: Quadratic, velocity) -> jax.Array:
 
 
 def entropies_of_temperatures(baths: HeatBaths, temperature) -> jax.Array:
-    """Return the entropies of baths, shape (..., number), at their temperatures, one for all or one each.
+    """Return the entropies of the baths, shape (..., number), at one temperature for all or one for each.
 
     Raises
     ------

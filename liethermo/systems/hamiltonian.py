@@ -276,7 +276,7 @@ class RotatingFrame(metaclass=ListedType):
         return f"<RotatingFrame of {len(self.levels)} levels, frequencies {self.levels.round(6).tolist()}>"
 
     def hamiltonian(self, hamiltonian, times=None) -> Callable:
-        """Return the Hamiltonian in the frame, a function of t to an array, shape (N, N), without approximation.
+        """Return the exact Hamiltonian in the rotating frame as a function from t to an array, shape (N, N).
 
         Parameters
         ----------

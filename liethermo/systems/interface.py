@@ -31,7 +31,8 @@ class InvariantVerdicts(NamedTuple):
 
     @classmethod
     def from_verdicts(cls, verdicts: Mapping[str, bool | None], declared: Iterable[str]) -> InvariantVerdicts:
-        """Build from a verdict on each function; declared functions count as conserved unless False."""
+        """Build from the verdicts, one for each function; a declared function counts as conserved unless its verdict
+        is False."""
         verdicts = {**verdicts, **{name: True for name in declared if verdicts.get(name, True) is None}}
         constant = {name for name, verdict in verdicts.items() if verdict}
         return cls(frozenset(constant), frozenset(name for name, verdict in verdicts.items() if verdict is None))

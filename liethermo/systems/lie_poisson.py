@@ -27,10 +27,10 @@ from .torque import (
     MAX_ARGUMENTS_WITHOUT_ATTITUDE,
     TorqueSystem,
     begins_with_rotations,
-    checked_torque,
     evaluate_torque,
     torque_free_components,
     torque_name,
+    traced_torque_and_argument_counts,
 )
 
 
@@ -228,7 +228,7 @@ class LiePoissonSystem(TorqueSystem):
 
     def _set_torque(self, torque) -> None:
         """Set the fields of the torque of a system with an algebra and a group."""
-        self.torque, self.torque_argument_counts = checked_torque(torque, self.algebra, self.group)
+        self.torque, self.torque_argument_counts = traced_torque_and_argument_counts(torque, self.algebra, self.group)
         self.torque_free_components = ()
         if torque is not None:
             model = self.torque, self.torque_argument_counts

@@ -85,8 +85,10 @@ class TorqueSystem(System):
         return super().field(x, dH, dS, dL)
 
 
-def checked_torque(given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | None) -> tuple[Any, tuple[int, ...]]:
-    """Return a checked torque with its plain functions traced, and the number of arguments of each of its terms.
+def traced_torque_and_argument_counts(
+    given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | None
+) -> tuple[Any, tuple[int, ...]]:
+    """Check a torque and trace its Python functions; return it, and the number of arguments of each of its terms.
 
     Raises
     ------

@@ -34,7 +34,7 @@ def _dtype(eqn, argument: int = 0) -> np.dtype:
 
 
 def _builder_method_rule(method: str) -> Rule:
-    """Return the rule that applies a method of the builder to numbers."""
+    """Return the rule of an elementwise primitive: the method of the builder with this name, applied to each entry."""
 
     def rule(b, eqn, *arrays):
         if _dtype(eqn).kind == "b":

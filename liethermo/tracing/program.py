@@ -88,7 +88,10 @@ class Program:
         return [assemble_output(entries, shape) for entries, shape in zip(self.run(*values), self.shapes, strict=True)]
 
     def run(self, *arrays: Sequence) -> list[list]:
-        """Return the entries of the outputs for the entries of the inputs: numbers, or arrays over many points."""
+        """Evaluate the program with NumPy: return the entries of its outputs for those of its inputs.
+
+        Entries are numbers, or arrays over many points.
+        """
         plan = self._interpretation_plan
         values = plan.initial_values.copy()
         for slots, entries in zip(plan.input_slots, arrays, strict=True):

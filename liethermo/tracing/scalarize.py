@@ -215,7 +215,7 @@ MOVE_PRIMITIVES = frozenset(
 
 
 def _round_to_dtype(b: Builder, eqn, results: list[np.ndarray]) -> list[np.ndarray]:
-    """Return the results of an equation as their dtypes hold them: float32 rounded, integers wrapped around."""
+    """Return the results of an operation rounded to their data types: float32 rounded, integers wrapped around."""
     name, rounded_results = eqn.primitive.name, []
     for var, result in zip(eqn.outvars, results, strict=True):
         dtype = var.aval.dtype

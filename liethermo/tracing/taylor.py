@@ -164,7 +164,8 @@ class _Recurrences:
         return [(i, self.terms[i].start) for i in indices]
 
     def _topological_order(self, result: int) -> list[int]:
-        """Return the terms that a result needs, each after its ``current_terms``; ``history_terms`` may come later."""
+        """Return the terms of the recurrence on which a result depends, each after the terms that it needs at the
+        same order."""
         order, pending, visited_terms = [], [result], {0}
         while pending:
             stack = [(pending.pop(), False)]
@@ -253,7 +254,8 @@ def _linear_rule(recurrences: _Recurrences, eqn, values) -> list:
 
 
 def _next_coefficient_or_zero(value, coefficients):
-    """Return a coefficient of order one or more: the next of the iterator ``coefficients``, or zero for a constant."""
+    """Return the next Taylor coefficient, of order one or more, from the iterator ``coefficients``; zero for a
+    constant."""
     if isinstance(value, _SeriesIndex):
         return next(coefficients)
     return jnp.zeros_like(value) if jnp.issubdtype(jnp.result_type(value), jnp.inexact) else value

@@ -229,7 +229,7 @@ class ProgramWriter:
         return build.shuffle_vector(first_lane, ir.Constant(self.double_type, ir.Undefined), lane_indices)
 
     def has_true_lane(self, tests: ir.Value) -> ir.Value:
-        """Return whether a truth value holds in any lane, as one bit."""
+        """Return one boolean: whether a condition is true in any of the SIMD lanes."""
         if self.lanes == 1:
             return tests
         bits = ir.IntType(self.lanes)

@@ -90,9 +90,10 @@ def uniaxial_anisotropy(sites, coefficients: Mapping, axis=(0.0, 0.0, 1.0)) -> E
 
 
 def cubic_anisotropy(sites, first=1.0, second=0.0, axes=None) -> Energy:
-    """Return the cubic anisotropy, ``sum K1 (x^2 y^2 + y^2 z^2 + z^2 x^2) + K2 x^2 y^2 z^2``.
+    """Return the energy of cubic anisotropy, ``sum K1 (x^2 y^2 + y^2 z^2 + z^2 x^2) + K2 x^2 y^2 z^2``.
 
-    x, y, z are the components of a spin along the cubic axes. K1 > 0 makes the cubic axes easy, as in iron.
+    The sum is over the sites, and x, y, z are the components of a spin along the cubic axes. K1 > 0 makes the cubic
+    axes easy, as in iron.
 
     Parameters
     ----------

@@ -177,7 +177,7 @@ TRACE_PROBES = 64
 
 @with_library_settings
 def spin_temperature(energy, spins, sites) -> float:
-    """Return the temperature k T (energy) that fits states of spins, the ratio of two means.
+    """Return the temperature k T (energy) of spins, estimated from their states as the ratio of two means.
 
     In equilibrium the mean of ``sum |s_i x grad_i H|^2 / |s_i|^2`` is kT times the mean of the Laplacian of H on the
     spheres of the spins. For bilinear energies that is ``kT = sum |s_i x B_i|^2 / 2 sum s_i . B_i`` with B = -grad H

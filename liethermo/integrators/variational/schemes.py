@@ -177,7 +177,8 @@ class VariationalIntegrator(OneStepMethod):
             raise InputError(f"for several bodies the maps of forces and constraint must be phi, and {self} has others")
         if any(type(map) is not FiniteDifference for map in self.phi):
             raise InputError(
-                f"for several bodies the maps must be lt.FiniteDifference itself, and {self} has a subclass"
+                f"for several bodies every map must be an lt.FiniteDifference, not a subclass, and {self} has "
+                "another map"
             )
         if len(self.phi) > 1 and system.poisson.species:
             raise InputError(

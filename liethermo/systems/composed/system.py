@@ -287,7 +287,7 @@ class ComposedSystem(System):
             terms.append(HeatConduction(graph._replace(weight=jnp.zeros(0)) if laws else graph, laws, conduction))
         if drag is not None:
             graph = graph_edges(drag, len(dofs), "the drag", self.names)
-            _require_velocities(graph, dofs, self.names)
+            _require_equal_velocity_counts(graph, dofs, self.names)
             terms.append(Drag(graph))
         return terms
 
@@ -413,7 +413,7 @@ def _require_connected(graph: Edges, names: tuple[str, ...]) -> None:
         )
 
 
-def _require_velocities(graph: Edges, dofs: tuple[int, ...], names: tuple[str, ...]) -> None:
+def _require_equal_velocity_counts(graph: Edges, dofs: tuple[int, ...], names: tuple[str, ...]) -> None:
     n = np.array(dofs)
     bad = np.flatnonzero((n[graph.first] != n[graph.second]) | (n[graph.first] == 0))
     if bad.size:

@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.integrators.tableaus import lobatto_rule
+from liethermo.integrators.tableaus import lobatto_nodes_and_weights
 from tests.liethermo.integrators.test_on_manifolds import CASES, starts
 from tests.liethermo.integrators.test_orders import NONLINEAR
 
@@ -61,7 +61,7 @@ def test_whole_powers_as_floats_near_zero(name):
 
 @pytest.mark.parametrize("nodes", range(2, 14))
 def test_quadrature(nodes):
-    c, b = lobatto_rule(nodes)
+    c, b = lobatto_nodes_and_weights(nodes)
     assert (b > 0.0).all()
     assert np.array_equal(c, np.sort(c))
     assert (c[0], c[-1]) == (0.0, 1.0)

@@ -62,7 +62,7 @@ test_invalid_samples_are_refused = refusal_test(
     (lambda: lt.latin_hypercube(4, seed=0, a=(0.0, 1.0, "log")), "positive with 'log'"),
     (lambda: lt.latin_hypercube(4, seed=0, a=3.0), r"must be \(low, high\)"),
     (lambda: lt.latin_hypercube(0, seed=0, a=(0.0, 1.0)), "positive integer"),
-    (lambda: lt.latin_hypercube(4, seed=0), "needs the ranges"),
+    (lambda: lt.latin_hypercube(4, seed=0), "needs at least one range"),
     (lambda: lt.replicas([0.0, 1.0]), r"shape \(replicas, n\)"),
     (lambda: lt.replicas([[0.0, 1.0], [np.inf, 1.0]]), "replica 1 is not finite"),
 )

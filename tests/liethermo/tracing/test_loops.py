@@ -196,7 +196,7 @@ def test_a_family_built_by_a_new_function_each_time():
         single_states = [lt.integrate(family(r), X, (0.0, 1.0), 0.1, engine="compiled").x[-1] for r in rates]
         assert np.abs(ensemble_states - single_states).max() < 1e-14
 
-    from liethermo.engines.compiled import stepper as compiled
+    from liethermo.engines.compiled import step_loop as compiled
 
     run(0.5)
     n_cached = len(compiled._step_loop_cache)
@@ -206,8 +206,8 @@ def test_a_family_built_by_a_new_function_each_time():
 
 @pytest.mark.slow
 def test_a_thousand_programs_that_differ(monkeypatch):
-    """Dropping a stepper unloads its machine code."""
-    from liethermo.engines.compiled import stepper as compiled
+    """Dropping a compiled loop of steps unloads its machine code."""
+    from liethermo.engines.compiled import step_loop as compiled
 
     monkeypatch.setattr(compiled, "_step_loop_cache", LRUCache(4))
 
