@@ -159,8 +159,8 @@ LEARNING_MEASUREMENTS = ("learn_gas", "learn_pendulum", "learn_body")
 """Measurements of learned systems, whose tables a page of their own shows in full."""
 
 THEME_NOTES = {
-    "The same scheme in C": "By their construction variational schemes 1 and 3 conserve the energy only "
-    "approximately, in C as in this library. Calls of 1000 steps keep every state.",
+    "The same scheme in C": "By construction, variational schemes 1 and 3 conserve the energy only approximately, "
+    "in the C programs as in this library. Calls of 1000 steps keep every state.",
     "One trajectory at equal accuracy": "The error is relative, at t = 100. The other programs are prepared once; a "
     "run of this library is a call of `integrate`, which prepares it anew.",
     "Many trajectories at equal accuracy": "The error is the largest of 32 states at t = 10. The drifts of the other "

@@ -86,6 +86,6 @@ def run(is_quick: bool) -> Report:
         "inertia (2.4, 2, 1.4) and from 2.5 times the friction. The data contain no momentum, temperature or entropy. "
         "Attitudes determine the inertia up to a factor, so the table has the relative errors of quantities that do "
         "not depend on this factor. *Angle* is the largest error of a forecast to 2 T, in radians. The long forecast "
-        "lasts 100 T. GFINN and NMS learn from states, so they cannot solve this problem."
+        "lasts 100 T. GFINN and NMS need full states as data, so they cannot solve this problem."
     )
     return Report("Learned: a body from its attitudes", text, [Table("", columns, rows)])
