@@ -51,7 +51,8 @@ def run(is_quick: bool) -> Report:
     """Measure the library and MuJoCo on the chain."""
     t_end = 10.0 if is_quick else 1000.0
     builders = {
-        "MetriplecticGauss(2)": lambda: library_row(0.1, t_end),
+        "MetriplecticGauss(2)": lambda: library_row(lt.MetriplecticGauss(2), 0.1, t_end),
+        "MetriplecticRungeKutta(4)": lambda: library_row(lt.MetriplecticRungeKutta(4), 0.05, t_end),
         "MuJoCo, RK4": lambda: mujoco_row(0.01, t_end),
     }
     rows, skip_reasons = build_available(builders)
@@ -75,20 +76,20 @@ def chain() -> lt.bodies.JointedBodies:
     return system
 
 
-def library_row(step: float, t_end: float) -> list:
-    """Return the row of the library."""
+def library_row(method: lt.OneStepMethod, step: float, t_end: float) -> list:
+    """Return the row of a method of the library."""
     system = chain()
     angles = {f"link {i + 1}": angle for i, angle in enumerate(INITIAL_ANGLES)}
     x0 = system.state(angular_velocity=ANGULAR_VELOCITY, joints=angles)
     integrate: Callable = lambda t: lt.integrate(  # noqa: E731
-        system, x0, (0.0, t), step, lt.MetriplecticGauss(2), save_every=10
+        system, x0, (0.0, t), step, method, save_every=round(1.0 / step)
     )
-    integrate(10.0 * step)
+    integrate(min(t_end, 2000.0 * step))  # as many steps as the compiled engine optimises for
     start = time.process_time()
     solution = integrate(t_end)
     seconds = (time.process_time() - start) / round(t_end / step)
     momenta = np.einsum("tij,tj->ti", solution.attitude, solution.x[:, :3])
-    return ["MetriplecticGauss(2)", step, seconds, *relative_changes(solution.energy, momenta)]
+    return [str(method), step, seconds, *relative_changes(solution.energy, momenta)]
 
 
 def mujoco_row(step: float, t_end: float) -> list:
