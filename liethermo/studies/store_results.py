@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import zarr
 
 from ..errors import FileError
 from ..results.audit import Audit, AuditRow, Tolerances, check_laws
@@ -17,33 +16,6 @@ from . import store_metadata
 from .progress import StudyStatus, seconds_left
 from .solve import EMPTY_POINT_STATUS, LAW_BROKEN, MEASURE_FAILED, STATUSES, SUCCESS_CODES, LawSummary
 from .store import StudyStore
-
-
-class CheckedZarrReader(zarr.storage.LocalStore):
-    """Zarr store that checks each chunk before it is read.
-
-    Parameters
-    ----------
-    study_store : StudyStore
-    owner : object
-        Kept alive as long as this reader, for example a temporary folder.
-    """
-
-    def __init__(self, study_store: StudyStore, owner: object = None):
-        super().__init__(study_store.root, read_only=True)
-        self.study_store, self.owner = study_store, owner
-
-    def with_read_only(self, read_only: bool = False) -> CheckedZarrReader:
-        """Return this reader, which is always read-only."""
-        return self
-
-    async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
-        """Return the content of a file; raise FileError if it is damaged, or missing although marked as finished."""
-        name, chunk_separator, index = key.partition("/c/")
-        if chunk_separator and name in self.study_store.arrays:
-            self.study_store.require_chunk(name, tuple(map(int, index.split("/"))))
-        return await super().get(key, prototype, byte_range)
-
 
 if TYPE_CHECKING:
     import xarray
@@ -77,6 +49,8 @@ def open_results(path: Path, owner: object) -> xarray.Dataset:
     """Return the results in a store; arrays are read at their first use, and keep ``owner`` alive until then."""
     store = StudyStore.open(path)
     import xarray
+
+    from .reader import CheckedZarrReader
 
     try:
         dataset = xarray.open_zarr(CheckedZarrReader(store, owner), consolidated=True, chunks=None)

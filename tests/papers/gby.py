@@ -16,7 +16,7 @@ from . import Difference, Order, Tests, Value, fields, order, relative_differenc
 variational = Tests("integrators.test_variational")
 on_groups = Tests("integrators.test_variational_lie")
 structure = Tests("integrators.test_variational_structure")
-chetaev = Tests("systems.test_chetaev")
+chetaev = Tests("systems.test_simple_closed")
 composed = Tests("systems.test_composed")
 configurations = Tests("systems.test_configurations")
 
@@ -60,8 +60,8 @@ def open_system():
 
 @row("GBY", "(2.4), open", "`external=`, `heat_power=`, the ledger; `MetriplecticGauss(2)`", "SciPy at $10^{-13}$")
 def ledger() -> Order:
-    exact = solve_with_scipy(pushed_field, np.append(chetaev.X0, np.zeros(3)), 2.0)
-    return order(open_system(), chetaev.X0, 2.0, exact, lt.MetriplecticGauss(2))
+    exact = solve_with_scipy(pushed_field, np.append(chetaev.CHETAEV_START, np.zeros(3)), 2.0)
+    return order(open_system(), chetaev.CHETAEV_START, 2.0, exact, lt.MetriplecticGauss(2))
 
 
 @row("GBY", "§2 on a group", '`EulerPoincareClosedSystem`, `LieVariational("exp")`', "SciPy at $10^{-13}$")
@@ -109,21 +109,21 @@ def scheme_3():
 
 @row("GBY", "(3.5)–(3.12)", "scheme 2 on a Lagrangian of no special form", "SciPy at $10^{-13}$")
 def scheme_2_order() -> Order:
-    exact = solve_with_scipy(pushed_field, np.append(chetaev.X0, np.zeros(3)), 2.0)
-    return order(open_system(), chetaev.X0, 2.0, exact, V.midpoint(), (40, 80), laws=False)
+    exact = solve_with_scipy(pushed_field, np.append(chetaev.CHETAEV_START, np.zeros(3)), 2.0)
+    return order(open_system(), chetaev.CHETAEV_START, 2.0, exact, V.midpoint(), (40, 80), laws=False)
 
 
 @row("GBY", "Remark 3.5", "maps of the forces chosen apart", "SciPy at $10^{-13}$")
 def maps_apart() -> Order:
     method, _ = variational.ORDERS["symmetric forces apart"]
-    exact = solve_with_scipy(pushed_field, np.append(chetaev.X0, np.zeros(3)), 2.0)
-    return order(open_system(), chetaev.X0, 2.0, exact, method, (40, 80), laws=False)
+    exact = solve_with_scipy(pushed_field, np.append(chetaev.CHETAEV_START, np.zeros(3)), 2.0)
+    return order(open_system(), chetaev.CHETAEV_START, 2.0, exact, method, (40, 80), laws=False)
 
 
 @row("GBY", "§5.1", "the $\\alpha$ family at $\\alpha = 0.3$", "SciPy at $10^{-13}$")
 def alpha_family() -> Order:
-    exact = solve_with_scipy(pushed_field, np.append(chetaev.X0, np.zeros(3)), 2.0)
-    return order(open_system(), chetaev.X0, 2.0, exact, V.midpoint(0.3), (320, 640), laws=False)
+    exact = solve_with_scipy(pushed_field, np.append(chetaev.CHETAEV_START, np.zeros(3)), 2.0)
+    return order(open_system(), chetaev.CHETAEV_START, 2.0, exact, V.midpoint(0.3), (320, 640), laws=False)
 
 
 @row("GBY", "(3.13)–(3.15)", "the matrix of regularity, scheme 2", "(5.3) as it should be")

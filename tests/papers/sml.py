@@ -26,7 +26,7 @@ from . import (
     solve_with_scipy,
 )
 
-chetaev = Tests("systems.test_chetaev")
+chetaev = Tests("systems.test_simple_closed")
 composed = Tests("systems.test_composed")
 configurations = Tests("systems.test_configurations")
 evolution = Tests("systems.test_evolution")
@@ -125,8 +125,8 @@ def thermodynamic_field():
 
 @row("SML", "Def. 3.1, (13), (14)", "`ChetaevSystem` by `MetriplecticGauss(2)`", "SciPy at $10^{-13}$")
 def chetaev_order() -> Order:
-    exact = solve_with_scipy(chetaev.field_by_hand, chetaev.X0, 2.0)
-    return order(chetaev.chetaev_system(), chetaev.X0, 2.0, exact, lt.MetriplecticGauss(2))
+    exact = solve_with_scipy(chetaev.field_by_hand, chetaev.CHETAEV_START, 2.0)
+    return order(chetaev.chetaev_system(), chetaev.CHETAEV_START, 2.0, exact, lt.MetriplecticGauss(2))
 
 
 @row("SML", "Prop. 3.3", "`ChetaevSystem` with $\\eta_L$ is `ThermodynamicHerglotz`", "the equations by hand")

@@ -63,7 +63,7 @@ BAD = {
     "two samples": (lambda: mag.binder_cumulant(np.ones((2, 3))), "n >= 4"),
     "two temperatures": (
         lambda: mag.cumulant_crossing(*(mag.MagnetSamples(T, np.ones(9), np.ones((9, 3))) for T in (1.0, 2.0))),
-        "one temperature",
+        "the same temperature",
     ),
     "too few energies": (
         lambda: mag.cumulant_crossing(*(mag.MagnetSamples(1.0, np.ones(8), np.ones((9, 3))) for _ in range(2))),
