@@ -372,7 +372,7 @@ def _velocities(steps: list[_Elimination]) -> jax.Array:
     """Return the velocities at which the function of :func:`_eliminate_velocities` is smallest, shape (n,)."""
     v = jnp.zeros(0)
     for step in reversed(steps):
-        v = jnp.append(v, (step.momentum - jnp.dot(step.column, v)) / step.pivot)
+        v = jnp.concatenate([v, ((step.momentum - jnp.sum(step.column * v)) / step.pivot)[None]])
     return v
 
 
