@@ -277,8 +277,10 @@ class ArticulatedBodies(Module):
         """
         poses, b = self.poses(q), self._n_base_screws
         composites, screws = self.composite_inertias(poses), self.screws(poses)
-        steps = _eliminate_velocities(self._inertia_matrix(screws, composites), self._momenta(Pi, p))
-        rates = _velocities(steps)
+        # behind barriers: otherwise XLA computes both again for each of their uses
+        H = jax.lax.optimization_barrier(self._inertia_matrix(screws, composites))
+        steps = _eliminate_velocities(H, self._momenta(Pi, p))
+        rates = jax.lax.optimization_barrier(_velocities(steps))
         moves = np.concatenate([np.ones((self.n_joints + 1, b)), self._path_matrix], axis=1)
         velocities = moves @ (rates[:, None] * screws)
         momenta = self._bodies_beyond[1:] @ self._body_momenta(poses, velocities[np.array(self.body_links)])
