@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 import liethermo as lt
-from liethermo.models.gases import CASES
+from liethermo.models.gases import MASS_SPRING_CASES
 
 from ..contest import race_one_trajectory, require_same_scheme
 from ..native import BodyProgram
@@ -71,7 +71,7 @@ def run(is_quick: bool) -> Report:
 
 
 def c_program(number: int) -> BodyProgram:
-    system = CASES[1]
+    system = MASS_SPRING_CASES[1]
     parameters = [system["mass"], system["stiffness"], FRICTION, 1.5 * system["moles"] * 8.31446261815324, 300.0]
     return BodyProgram("variational.c", parameters, f"-DSCHEME={number}")
 
@@ -81,7 +81,7 @@ def c_run(number: int, steps: int) -> Callable:
 
 
 def library_run(number: int, steps: int, save_every: int) -> Callable[[], lt.Solution]:
-    system = lt.models.mass_spring_gas(**CASES[1], friction=FRICTION)
+    system = lt.models.mass_spring_gas(**MASS_SPRING_CASES[1], friction=FRICTION)
     span = (0.0, STEP * steps)
     return functools.partial(
         lt.integrate, system, X0, span, STEP, SCHEMES[number], save_every=save_every, engine="compiled"

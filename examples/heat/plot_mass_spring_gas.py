@@ -12,7 +12,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import liethermo as lt
-from liethermo.models.gases import CASES, STARTS, mass_spring_gas_solution
+from liethermo.models.gases import (
+    MASS_SPRING_CASES,
+    MASS_SPRING_STARTS,
+    mass_spring_gas_solution,
+)
 
 h, steps = 1e-3, 100_000
 frictions = (0.0, 0.2, 5.0, 10.0)
@@ -28,10 +32,10 @@ def study(case):
     """Return runs and relative energy errors at the points of each scheme."""
     runs = {}
     for friction in frictions:
-        system = lt.models.mass_spring_gas(**CASES[case], friction=friction)
+        system = lt.models.mass_spring_gas(**MASS_SPRING_CASES[case], friction=friction)
         for name, method in schemes.items():
             x0 = method.state(
-                system, STARTS[case], STARTS[case], S0=0.0, h=h
+                system, MASS_SPRING_STARTS[case], MASS_SPRING_STARTS[case], S0=0.0, h=h
             )  # from two positions, as in the paper
             solution = lt.integrate(system, x0, (0.0, steps * h), h, method)
             E = method.energies(system, solution.x, h)
@@ -50,11 +54,14 @@ def draw(case, runs):
         4, len(frictions), figsize=(11.0, 8.5), sharey="row", layout="constrained"
     )
     for column, friction in zip(axes.T, frictions, strict=True):
-        system = lt.models.mass_spring_gas(**CASES[case], friction=friction)
+        system = lt.models.mass_spring_gas(**MASS_SPRING_CASES[case], friction=friction)
         end = steps * h if friction < 1 else 20.0
         t = np.linspace(0.0, end, 1000)
         exact = mass_spring_gas_solution(
-            t, runs[friction, "scheme 2"][0].x[0], **CASES[case], friction=friction
+            t,
+            runs[friction, "scheme 2"][0].x[0],
+            **MASS_SPRING_CASES[case],
+            friction=friction,
         )
         for ax, series in zip(
             column,

@@ -49,7 +49,7 @@ SUBSTEP_COUNTS = (2, 4, 8, 16)
 
 
 Engine: TypeAlias = ArrayEngine | CompiledEngine | SparseEngine
-"""An engine takes the steps of one method on one system: see :class:`.array.ArrayEngine`."""
+"""An engine takes the steps of one method on one system: see :class:`.array_engine.ArrayEngine`."""
 
 
 class CompiledEngineWarning(UserWarning):

@@ -26,7 +26,7 @@ from ..tracing.programs import subprogram
 
 
 class Poses(NamedTuple):
-    """Rotations and positions of the links of a tree, in axes of the base.
+    """Places of the links, joints and bodies of a tree, in axes of the base.
 
     Attributes
     ----------
@@ -36,11 +36,17 @@ class Poses(NamedTuple):
         Origin of each link, from the origin of the base.
     joint_screws : array, shape (k, 6)
         Screw of the joint that moves each link but the base.
+    body_centres : array, shape (m, 3)
+        Centre of mass of each body, from the origin of the base.
+    body_inertias : array, shape (m, 3, 3)
+        Tensor of inertia of each body about its centre of mass.
     """
 
     rotations: jax.Array
     positions: jax.Array
     joint_screws: jax.Array
+    body_centres: jax.Array
+    body_inertias: jax.Array
 
 
 class SpatialInertias(NamedTuple):
@@ -161,7 +167,7 @@ class ArticulatedBodies(Module):
     # -- kinematics and inertia ---------------------------------------------------------------------------------------
 
     def poses(self, q) -> Poses:
-        """Return rotations and positions of all links and the screws of the joints, for joint coordinates q.
+        """Return the places of all links, joints and bodies for joint coordinates q, shape (k,).
 
         The pose of each link in its parent is composed with that of the parent, then with that of the parent's parent,
         and so on with twice as many links each time, for all links at once.
@@ -182,23 +188,16 @@ class ArticulatedBodies(Module):
             jnp.concatenate([jnp.zeros_like(axes), axes], axis=1),
             jnp.concatenate([axes, jnp.cross(positions[1:], axes)], axis=1),
         )
-        return Poses(rotations, positions, screws)
-
-    def body_centres(self, poses: Poses) -> jax.Array:
-        """Return the centre of mass of each body, from the origin of the base, shape (m, 3)."""
         links = np.array(self.body_links)
-        return poses.positions[links] + _products(poses.rotations[links], self.centres)
-
-    def central_inertias(self, poses: Poses) -> jax.Array:
-        """Return the tensor of inertia of each body about its centre of mass, in axes of the base, shape (m, 3, 3)."""
-        R = poses.rotations[np.array(self.body_links)]
-        return R @ self.inertias @ jnp.swapaxes(R, 1, 2)
+        R = rotations[links]
+        centres, inertias = positions[links] + _products(R, self.centres), R @ self.inertias @ jnp.swapaxes(R, 1, 2)
+        return Poses(rotations, positions, screws, centres, inertias)
 
     def composite_inertias(self, poses: Poses) -> SpatialInertias:
         """Return for each link the inertia of all bodies that move with it, n = k + 1; the base moves all."""
-        centres, masses = self.body_centres(poses), self.masses[:, None]
+        centres, masses = poses.body_centres, self.masses[:, None]
         squares = jnp.sum(centres**2, axis=1)[:, None, None] * jnp.eye(3) - centres[:, :, None] * centres[:, None, :]
-        rotational = self.central_inertias(poses) + masses[:, :, None] * squares
+        rotational = poses.body_inertias + masses[:, :, None] * squares
         inertias = jnp.concatenate([masses, masses * centres, rotational.reshape(-1, 9)], axis=1)
         sums = jnp.asarray(self._bodies_beyond) @ inertias
         return SpatialInertias(sums[:, 0], sums[:, 1:4], sums[:, 4:].reshape(-1, 3, 3))
@@ -221,14 +220,18 @@ class ArticulatedBodies(Module):
         entries = jnp.where(is_below, momenta @ screws.T, 0.0)
         return entries + jnp.where(is_below & ~np.eye(len(links), dtype=bool), entries, 0.0).T
 
+    def _inertia_matrix_at(self, q) -> jax.Array:
+        """Return :meth:`_inertia_matrix` at joint coordinates q."""
+        poses = self.poses(q)
+        return self._inertia_matrix(self.screws(poses), self.composite_inertias(poses))
+
     def mass_matrix(self, q) -> jax.Array:
         """Return M(q), shape (3 + k, 3 + k), for which the kinetic energy is ``(Omega, q') . M(q) (Omega, q') / 2``.
 
         The linear momentum is zero. M is the matrix of a free base by the composite-body recursion, with the linear
         velocity eliminated by a Schur complement, whose pivot is the total mass. On the ground M has the shape (k, k).
         """
-        poses = self.poses(q)
-        H = self._inertia_matrix(self.screws(poses), self.composite_inertias(poses))
+        H = self._inertia_matrix_at(q)
         if self.is_fixed:
             return H
         kept = np.delete(np.arange(len(H)), [3, 4, 5])
@@ -248,16 +251,13 @@ class ArticulatedBodies(Module):
 
     def pivots(self, q) -> jax.Array:
         """Return the inertia that each joint moves if all joints beyond it are free, shape (k,)."""
-        poses = self.poses(q)
-        H = self._inertia_matrix(self.screws(poses), self.composite_inertias(poses))
+        H = self._inertia_matrix_at(q)
         steps = _eliminate_velocities(H, jnp.zeros(len(H)))
         return jnp.stack([step.pivot for step in steps[: self.n_joints]])[::-1]
 
     def kinetic_energy(self, Pi, q, p) -> jax.Array:
         """Return the kinetic energy ``(Pi, p) . M(q)^-1 (Pi, p) / 2``, a sum of squares."""
-        poses = self.poses(q)
-        H = self._inertia_matrix(self.screws(poses), self.composite_inertias(poses))
-        return _sum_of_squares(_eliminate_velocities(H, self._momenta(Pi, p)))
+        return _sum_of_squares(_eliminate_velocities(self._inertia_matrix_at(q), self._momenta(Pi, p)))
 
     def _momenta(self, Pi, p) -> jax.Array:
         """Return the momenta that belong to all screws. Without linear momentum Pi is the same about every point."""
@@ -292,20 +292,20 @@ class ArticulatedBodies(Module):
 
     def _body_momenta(self, poses: Poses, velocities) -> jax.Array:
         """Return the spatial momentum of each body at its spatial velocity, both of shape (m, 6)."""
-        centres, omega = self.body_centres(poses), velocities[:, :3]
+        centres, omega = poses.body_centres, velocities[:, :3]
         linear = self.masses[:, None] * (velocities[:, 3:] + jnp.cross(omega, centres))
-        angular = _products(self.central_inertias(poses), omega) + jnp.cross(centres, linear)
+        angular = _products(poses.body_inertias, omega) + jnp.cross(centres, linear)
         return jnp.concatenate([angular, linear], axis=1)
 
     # -- gravity ------------------------------------------------------------------------------------------------------
 
     def common_centre(self, poses: Poses) -> jax.Array:
         """Return the centre of mass of the whole, from the origin of the base, shape (3,)."""
-        return self.masses @ self.body_centres(poses) / jnp.sum(self.masses)
+        return self.masses @ poses.body_centres / jnp.sum(self.masses)
 
     def weight_potential(self, q, gravity) -> jax.Array:
         """Return the potential energy ``-sum m_j g . r_j`` in a uniform field g, shape (3,), from the ground."""
-        return -jnp.dot(gravity, self.masses @ self.body_centres(self.poses(q)))
+        return -jnp.dot(gravity, self.masses @ self.poses(q).body_centres)
 
     def weight_forces(self, q, gravity) -> jax.Array:
         """Return the forces of a uniform field on the joint coordinates, shape (k,)."""
@@ -320,9 +320,9 @@ class ArticulatedBodies(Module):
         mass adds the torque ``3 n × I n`` [Hughes, *Spacecraft Attitude Dynamics*, 1986, 8.1].
         """
         poses, n = self.poses(q), direction
-        offsets = self.body_centres(poses) - self.common_centre(poses)
+        offsets = poses.body_centres - self.common_centre(poses)
         forces = self.masses[:, None] * (3.0 * (offsets @ n)[:, None] * n - offsets)
-        torques = 3.0 * jnp.cross(n, self.central_inertias(poses) @ n)
+        torques = 3.0 * jnp.cross(n, poses.body_inertias @ n)
         joint_forces, total = self._collect_wrenches(poses, forces, torques)
         return total[:3], joint_forces  # the total force is zero, so the torque is the same about every point
 
@@ -332,7 +332,7 @@ class ArticulatedBodies(Module):
         Each force acts in the centre of mass of its body; both have the shape (m, 3). The wrench is (torque about the
         origin of the base, force).
         """
-        wrenches = jnp.concatenate([torques + jnp.cross(self.body_centres(poses), forces), forces], axis=1)
+        wrenches = jnp.concatenate([torques + jnp.cross(poses.body_centres, forces), forces], axis=1)
         sums = self._bodies_beyond @ wrenches
         return jnp.sum(poses.joint_screws * sums[1:], axis=1), sums[0]
 

@@ -201,13 +201,13 @@ class _PressureForce(Module):
         return -self.area * jnp.reshape(self.pressure(q, v, S, t), 1)
 
 
-CASES = {
+MASS_SPRING_CASES = {
     1: {"mass": 5.0, "stiffness": 5.0, "moles": 1.0},
     2: {"mass": 10.0, "stiffness": 20.0, "moles": 2.0},
 }
-"""The parameters of Cases 1 and 2 of the paper, for ``mass_spring_gas(**CASES[1], friction=...)``."""
+"""The parameters of Cases 1 and 2 of [GBY 5.5], for ``mass_spring_gas(**MASS_SPRING_CASES[1], friction=...)``."""
 
-STARTS = {1: 0.3, 2: 0.1}
+MASS_SPRING_STARTS = {1: 0.3, 2: 0.1}
 """Initial positions ``x_0 = x_1`` (m) of both cases, with S_0 = 0; the paper's step is 1e-3 s."""
 
 

@@ -102,10 +102,8 @@ def velocities_at_states(name: str, system: System, x: np.ndarray) -> np.ndarray
 
 
 def _velocities(system: System, x) -> dict[str, Any]:
+    """Return the velocities at a state, shape (n,), by their names, shape (k,) each."""
     return {name: velocity(x) for name, velocity in system.motion_quantities.velocities.items()}
-
-
-"""Functions of a system and a state, shape (n,), to velocities, shape (k,), by the name of the result."""
 
 
 def series_of_functions(functions: Mapping[str, Energy], x: np.ndarray) -> dict[str, np.ndarray]:

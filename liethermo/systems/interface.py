@@ -166,8 +166,9 @@ class SystemInterface(Geometry):
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
-        for name in REPLACED_MEMBERS.keys() & cls.__dict__.keys():
-            raise TypeError(f"{cls.__name__} defines {name}, which nothing calls. Override {REPLACED_MEMBERS[name]}")
+        for name, replacement in REPLACED_MEMBERS.items():
+            if name in cls.__dict__:
+                raise TypeError(f"{cls.__name__} defines {name}, which nothing calls. Override {replacement}")
 
     entropy: Energy | None
     dissipation: Dissipation | None

@@ -140,9 +140,10 @@ class QuantumSystem(System):
                 f"the entropy of a density matrix must be lt.VonNeumann(...), not {type(entropy).__name__}"
             )
         self.floor = entropy.floor
-        if all(isinstance(term, LindbladJumps) for term in dissipation_terms(dissipation)):
+        terms = _checked_terms(dissipation)
+        if all(isinstance(term, LindbladJumps) for term in terms):
             entropy = IsolatedVonNeumann(self.floor)  # the motion does not depend on it
-        terms = [_bind_to_density(term, structure) for term in _dissipation_terms(dissipation)]
+        terms = tuple(_bind_to_density(term, structure) for term in terms)
         if baths is not None and not any(isinstance(term, ThermalJumps) for term in terms):
             raise InputError(
                 "baths= needs lt.ThermalJumps, which exchange heat with the baths. Add them, or remove baths="
@@ -579,7 +580,7 @@ class QuantumSystem(System):
         return self.hamiltonians()[0]
 
 
-def _dissipation_terms(dissipation) -> tuple[Dissipation, ...]:
+def _checked_terms(dissipation) -> tuple[Dissipation, ...]:
     terms = dissipation_terms(dissipation)
     for term in terms:
         if not isinstance(term, ThermalJumps | SteepestEntropyAscent | LindbladJumps):

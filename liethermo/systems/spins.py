@@ -130,17 +130,10 @@ class SpinSystem(TorqueSystem):
         parts, spins, n = _split_damping(self.total_dissipation), self._spin_structure, self.body_dim
         if parts is None or spins is None:
             return super()._field_without_torque(x, dH, dS, dL)
-        damping, heating, conduction = parts
-        if heating is None:
-            force, _ = damping.damping_force_and_energy_loss(spins, x, dH)
-            entropy_rates = jnp.zeros(self.dim - n)
-        else:  # the entropy is that of the baths
-            force, lost_power = damping.damping_force_and_energy_loss(
-                spins, x, dH, heating.temperature_signs(dH[n:]), heating.has_site_baths
-            )
-            entropy_rates = heating.entropy_rates(lost_power, dH[n:])
-        for term in conduction:
-            entropy_rates = entropy_rates + term.entropy_rates(dH[n:], dS[n:])
+        force, lost_power = parts.damping.damping_force_and_energy_loss(
+            spins, x, dH, parts.temperature_signs(dH[n:]), parts.has_site_baths
+        )
+        entropy_rates = parts.bath_entropy_rates(lost_power, dH, dS, n)
         return spins.join_state(add_vectors(spins.precession_rates(x, dH), force), entropy_rates)
 
     # -- the torque -----------------------------------------------------------------------------------------------
@@ -183,19 +176,14 @@ class SpinSystem(TorqueSystem):
         spins, parts, n = self._spin_structure, _split_damping(self.total_dissipation), self.body_dim
         if spins is None or parts is None:
             return None
-        damping, heating, conduction = parts
         s, gradient = spins.split_covectors(x), spins.split_covectors(dH)
-        rate = -damping.rate.reshape(-1) * (1.0 if heating is None else heating.temperature_signs(dH[n:]))
+        rate = -parts.damping.rate.reshape(-1) * parts.temperature_signs(dH[n:])
         rates = add_vectors(split_vectors(noise_rates), scale_vectors(-spins.ratio.reshape(-1), gradient))
         rates = add_vectors(rates, scale_vectors(rate, cross_vectors(s, gradient)))
-        v, entropy_rates = cross_vectors(rates, s), others[n:]
-        if heating is not None:
-            lost_power = -dot_vectors(gradient, v)
-            entropy_rates = entropy_rates + heating.entropy_rates(
-                lost_power if heating.has_site_baths else jnp.sum(lost_power), dH[n:]
-            )
-        for term in conduction:
-            entropy_rates = entropy_rates + term.entropy_rates(dH[n:], dS[n:])
+        v = cross_vectors(rates, s)
+        lost_power = -dot_vectors(gradient, v)
+        lost_power = lost_power if parts.has_site_baths else jnp.sum(lost_power)
+        entropy_rates = others[n:] + parts.bath_entropy_rates(lost_power, dH, dS, n)
         v = add_vectors(v, spins.split_covectors(others))
         if (external_velocity := self.external_velocity(x, dH)) is not None:
             v = add_vectors(v, spins.split_covectors(external_velocity))
@@ -364,6 +352,33 @@ class _DampingParts(NamedTuple):
     damping: LandauLifshitz
     heating: Heating | None
     conduction: tuple[BathConduction, ...]
+
+    @property
+    def has_site_baths(self) -> bool:
+        """True if the sites heat baths of their own."""
+        return self.heating is not None and self.heating.has_site_baths
+
+    def temperature_signs(self, T) -> jax.Array | float:
+        """Return the sign of the temperature of the bath that each site heats, for temperatures T, shape (m,)."""
+        return 1.0 if self.heating is None else self.heating.temperature_signs(T)
+
+    def bath_entropy_rates(self, energy_loss, dH, dS, body_dim: int) -> jax.Array:
+        """Return the growth rates of the entropies of the baths, shape (m,).
+
+        Parameters
+        ----------
+        energy_loss : array, shape () or (sites,)
+            Power that the spins lose: of all, or of each site if these have baths of their own.
+        dH, dS : array, shape (body_dim + m,)
+            Gradients of the energy and of the entropy; dS may be None without conduction.
+        body_dim : int
+            Index of the entropy of the first bath in a state.
+        """
+        T = dH[body_dim:]
+        rates = jnp.zeros_like(T) if self.heating is None else self.heating.entropy_rates(energy_loss, T)
+        for term in self.conduction:
+            rates = rates + term.entropy_rates(T, dS[body_dim:])
+        return rates
 
 
 def _split_damping(dissipation: Dissipation) -> _DampingParts | None:

@@ -80,9 +80,8 @@ def check_laws_along_run(suite: Suite, system: System, method: OneStepMethod, x0
     check_completion(suite, f"{label}run", solution)
     for row in solution.audit().rows:
         if row.passed is not None and row.law not in (STEPS_TAKEN_ROW, ACCURACY_ROW):
-            passed = (
-                None if row.note == INEXACT_LAW_NOTE else row.passed
-            )  # what it does not claim to keep is not judged
+            # what the method does not claim to keep is not judged
+            passed = None if row.note == INEXACT_LAW_NOTE else row.passed
             suite.rows.append(replace(row, name=f"{label}{row.law}", passed=passed))
     rebuilt_run = integrate(
         rebuild_pytree(system), x0, (0.0, N_STEPS * h), h, rebuild_pytree(method), on_failure="return", engine="array"

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import liethermo as lt
-from liethermo.models.gases import CASES, STARTS, mass_spring_gas_solution
+from liethermo.models.gases import MASS_SPRING_CASES, MASS_SPRING_STARTS, mass_spring_gas_solution
 from liethermo.tracing.interpret import evaluate_at_points
 
 from . import Difference, Order, Tests, Value, fields, order, relative_difference, row, solve_with_scipy
@@ -85,7 +85,11 @@ def manifold_map_order() -> Order:
 
 def recursions(name: str) -> Difference:
     """Compare 500 steps of Case 1 with the printed recursion, with friction 10 and a long step."""
-    h, system, method = 0.05, lt.models.mass_spring_gas(**CASES[1], friction=10.0), variational.SCHEMES[name]
+    h, system, method = (
+        0.05,
+        lt.models.mass_spring_gas(**MASS_SPRING_CASES[1], friction=10.0),
+        variational.SCHEMES[name],
+    )
     run = lt.integrate(system, method.state(system, 0.3, 0.31, 0.0, h), (0.0, 500 * h), h, method)
     x, S = variational.printed_recursion(name, 0.3, 0.31, 0.0, 500, 5.0, 5.0, 10.0, 1.5 * 8.31446261815324, 300.0, h)
     expected = np.stack([x, S], axis=1).astype(float)
@@ -176,8 +180,11 @@ def closed_solution():
 
 def energies(case: int, scheme: int) -> Value:
     """Return the largest energy error of 10^4 steps without friction."""
-    system, method = lt.models.mass_spring_gas(**CASES[case], friction=0.0), variational.SCHEMES[f"scheme {scheme}"]
-    x0 = method.state(system, STARTS[case], STARTS[case], 0.0, variational.H)
+    system, method = (
+        lt.models.mass_spring_gas(**MASS_SPRING_CASES[case], friction=0.0),
+        variational.SCHEMES[f"scheme {scheme}"],
+    )
+    x0 = method.state(system, MASS_SPRING_STARTS[case], MASS_SPRING_STARTS[case], 0.0, variational.H)
     run = lt.integrate(system, x0, (0.0, 10_000 * variational.H), variational.H, method)
     assert run.stats.least_entropy_increment >= 0.0
     return Value(variational._deviation(method, system, run).max())

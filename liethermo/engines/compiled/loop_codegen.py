@@ -1,8 +1,8 @@
 """Step loop of the compiled engine: the array engine's own steps, as scalar programs, on lanes that advance together.
 
 A *block* is a group of trajectories that advance together, one SIMD lane each; a single trajectory is a block of one
-lane. The programs are traced from the functions of the array engine (:mod:`..array`), so both engines take the same
-steps; this module writes the loops around them. The fields of a block are held in registers, as far as there are
+lane. The programs are traced from the functions of the array engine (:mod:`..array_engine`), so both engines take the
+same steps; this module writes the loops around them. The fields of a block are held in registers, as far as there are
 enough, and written back when the loop is left.
 """
 

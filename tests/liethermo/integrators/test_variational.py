@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import liethermo as lt
-from liethermo.models.gases import CASES, STARTS, mass_spring_gas_solution
+from liethermo.models.gases import MASS_SPRING_CASES, MASS_SPRING_STARTS, mass_spring_gas_solution
 from liethermo.tracing.interpret import evaluate_at_points
 from tests.liethermo.closed_systems import ISOLATED_SYSTEMS, OPEN, SCHEMES, X0
 from tests.refusals import refusal_test
@@ -77,7 +77,7 @@ def printed_recursion(name, x0, x1, S0, steps, m, k, friction, heat, T0, h):
 )
 def test_the_printed_schemes(name, engine):
     """500 steps of Case 1 with friction 10 and a long step, from two positions, are the recursions of §5.2."""
-    h, system = 0.05, lt.models.mass_spring_gas(**CASES[1], friction=10.0)
+    h, system = 0.05, lt.models.mass_spring_gas(**MASS_SPRING_CASES[1], friction=10.0)
     start = SCHEMES[name].state(system, 0.3, 0.31, 0.0, h)
     solution = _run(system, SCHEMES[name], start, 500, h, engine=engine)
     heat = 1.5 * 8.31446261815324
@@ -175,13 +175,15 @@ def _momenta(discrete, x):
 
 
 @pytest.mark.sampled("scheme 1-2")
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", MASS_SPRING_CASES)
 @each_scheme
 def test_the_table_of_energies(case, name):
     """Cases 1 and 2 over 10^4 steps agree with the table within a factor of 3; S grows at every step."""
     for friction, table_value in zip(FRICTIONS, TABLE[case, name], strict=True):
-        system, method = lt.models.mass_spring_gas(**CASES[case], friction=friction), SCHEMES[name]
-        solution = _run(system, method, method.state(system, STARTS[case], STARTS[case], 0.0, H), 10_000)
+        system, method = lt.models.mass_spring_gas(**MASS_SPRING_CASES[case], friction=friction), SCHEMES[name]
+        solution = _run(
+            system, method, method.state(system, MASS_SPRING_STARTS[case], MASS_SPRING_STARTS[case], 0.0, H), 10_000
+        )
         deviation = _deviation(method, system, solution)
         assert deviation.max() < 3 * table_value, friction
         if table_value > 1e-14:  # not rounding
@@ -196,13 +198,13 @@ def _deviation(method, system, solution):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", MASS_SPRING_CASES)
 @each_scheme
 def test_the_table_over_1e5_steps(case, name):
     """The bounds hold to the end, and the entropy grows at every step at which friction still acts."""
     for friction, table_value in zip(FRICTIONS, TABLE[case, name], strict=True):
-        system, method = lt.models.mass_spring_gas(**CASES[case], friction=friction), SCHEMES[name]
-        x0 = method.state(system, STARTS[case], STARTS[case], 0.0, H)
+        system, method = lt.models.mass_spring_gas(**MASS_SPRING_CASES[case], friction=friction), SCHEMES[name]
+        x0 = method.state(system, MASS_SPRING_STARTS[case], MASS_SPRING_STARTS[case], 0.0, H)
         solution = _run(system, method, x0, 100_000, engine="compiled")
         deviation = _deviation(method, system, solution)
         assert deviation.max() < 3 * table_value, friction
@@ -241,7 +243,7 @@ def _slopes(errors):
 def test_orders_against_the_exact_solution(name, friction):
     method, order = ORDERS[name]
     assert method.order == order
-    system, x0, errors = lt.models.mass_spring_gas(**CASES[1], friction=friction), [0.3, 0.5, 0.0], []
+    system, x0, errors = lt.models.mass_spring_gas(**MASS_SPRING_CASES[1], friction=friction), [0.3, 0.5, 0.0], []
     for steps in (80, 160, 320, 640):
         solution = _run(system, method, x0, steps, 4.0 / steps, save_every=steps // 40)
         errors.append(np.abs(solution.x - mass_spring_gas_solution(solution.t, x0, friction=friction)).max(0))

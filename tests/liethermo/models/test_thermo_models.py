@@ -6,8 +6,8 @@ import pytest
 
 import liethermo as lt
 from liethermo.models.gases import (
-    CASES,
     GAS_CONSTANT,
+    MASS_SPRING_CASES,
     IdealGas,
     cylinder_rest,
     gas_piston_equilibrium,
@@ -226,14 +226,14 @@ def _rate(system, x):
 
 @pytest.mark.sampled(7)
 @pytest.mark.parametrize("friction", FRICTIONS.values(), ids=FRICTIONS)
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", MASS_SPRING_CASES)
 def test_the_exact_solution_solves_the_equations(case, friction):
     """Eighth-order differences of the exact solution agree with the field, in every regime of damping."""
-    system = lt.models.mass_spring_gas(**CASES[case], friction=friction)
+    system = lt.models.mass_spring_gas(**MASS_SPRING_CASES[case], friction=friction)
     t, d = np.linspace(0.5, 9.5, 10), 0.02
 
     def path(t):
-        return mass_spring_gas_solution(t, START, **CASES[case], friction=friction)
+        return mass_spring_gas_solution(t, START, **MASS_SPRING_CASES[case], friction=friction)
 
     weights = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
     slopes = sum(w * (path(t + i * d) - path(t - i * d)) / d for i, w in weights.items())
