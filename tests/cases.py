@@ -266,6 +266,27 @@ def combinations(algebras) -> list:
     ]
 
 
+def kind_of(g: mf.LieAlgebra) -> tuple:
+    """Return what a dissipation or a method may depend on in an algebra."""
+    return g.name in TRANSCENDENTAL, g.is_abelian(), g.is_nilpotent(), g.is_solvable(), g.is_semisimple()
+
+
+def covering(cases, keys: Callable) -> list:
+    """Return some of the cases that together have every key of all of them: few, and the same each time.
+
+    ``keys(*values)`` returns the keys of a case. Where they are pairs of its values, every value of one argument meets
+    every value of another, which a product of three arguments does many times over.
+    """
+    cases, chosen_indices, found_keys = list(cases), set(), set()
+    case_keys = [set(keys(*getattr(case, "values", case))) for case in cases]
+    for least_new_count in range(max(map(len, case_keys)), 0, -1):
+        for i, own_keys in enumerate(case_keys):
+            if len(own_keys - found_keys) >= least_new_count:
+                chosen_indices.add(i)
+                found_keys |= own_keys
+    return [cases[i] for i in sorted(chosen_indices)]
+
+
 def rows(audit, law):
     return [row for row in audit.rows if row.law.startswith(law)]
 

@@ -100,11 +100,11 @@ def body(function, dissipation=True):
     )
 
 
-@pytest.mark.sampled("fori_loop-explicit", "eigvalsh, complex-explicit", "lgamma-implicit", "single precision-explicit")
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize(
-    "method", [lt.MetriplecticMidpoint(), lt.MetriplecticRungeKutta(4)], ids=["implicit", "explicit"]
+    ("name", "method"),
+    [pytest.param(name, METHODS[i % 2], id=f"{name}-{METHODS[i % 2]}") for i, name in enumerate(FUNCTIONS)],
 )
-@pytest.mark.parametrize("name", FUNCTIONS)
 def test_functions_of_every_kind(name, method):
     system = body(FUNCTIONS[name])
     compiled_run, array_run = (

@@ -19,7 +19,7 @@ from scipy.integrate import solve_ivp
 
 import liethermo as lt
 import manifolds as mf
-from tests.cases import slow_case
+from tests.cases import covering
 
 CANONICAL = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.eye(2), np.zeros((2, 2))]])
 
@@ -270,25 +270,21 @@ def methods_for(name: str) -> list[lt.OneStepMethod]:
     return methods
 
 
-DEFAULT_GAUSS_CASES = {
-    ("central potential", 2),
-    ("symmetric top", 2),
-    ("chosen Casimir", 2),
-    ("sum of frictions", 2),
-}
-"""Problem and stages of the Gauss methods that run in the default tier."""
-
-
 def cases():
     for name in PROBLEMS:
         for i, method in enumerate(methods_for(name)):
-            runs_by_default = isinstance(method, lt.MetriplecticGauss) and (name, method.stages) in DEFAULT_GAUSS_CASES
-            case = pytest.param(name, method, id=f"{name}-{method}-{i}")
-            yield case if runs_by_default and not method.functions else slow_case(case)
+            yield pytest.param(name, method, id=f"{name}-{method}-{i}")
+
+
+def keys(name, method):
+    """Every problem meets every class of methods, and every method the problems with friction and those without."""
+    options = getattr(method, "functions", ()), getattr(method, "retraction", None)
+    with_friction = name not in ("central potential", "symmetric top")
+    return (name, type(method), *map(bool, options)), (str(method), with_friction)
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize(("name", "method"), list(cases()))
+@pytest.mark.parametrize(("name", "method"), covering(cases(), keys))
 def test_convergence(name, method):
     problem, system = PROBLEMS[name], SYSTEMS[name]()
     explicit = isinstance(method, lt.MetriplecticRungeKutta)

@@ -10,6 +10,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.integrators.explicit import StepRow
+from tests.cases import covering
 from tests.liethermo import random_systems
 
 RK = lt.MetriplecticRungeKutta
@@ -51,12 +52,15 @@ MAX_DIM_OF_ORDER_20 = 6
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("g", "method"),
-    [
-        pytest.param(g, method, id=f"{method}-{g.name}")
-        for g in random_systems.ALGEBRAS
-        for method in METHODS
-        if method.order < 20 or g.dim <= MAX_DIM_OF_ORDER_20
-    ],
+    covering(
+        (
+            pytest.param(g, method, id=f"{method}-{g.name}")
+            for g in random_systems.ALGEBRAS
+            for method in METHODS
+            if method.order < 20 or g.dim <= MAX_DIM_OF_ORDER_20
+        ),
+        lambda g, method: [(g.name, type(method)), method.order],
+    ),
 )
 def test_laws_of_a_thousand_systems(g, method):
     """The laws hold for 143 systems on each of seven algebras."""

@@ -78,13 +78,15 @@ def reference(system: lt.MetriplecticSystem, x0, T: float) -> np.ndarray:
     return solution.y[:, -1]
 
 
-@pytest.mark.sampled(
-    "sphere-MetriplecticRungeKutta(order=4)",
-    "SPD-MetriplecticGauss(stages=2)",
-    "ellipsoid-MetriplecticMidpoint(gradient=Gonzalez)",
+@pytest.mark.sampled("sphere-MetriplecticRungeKutta(order=4)", "SPD-MetriplecticMidpoint(gradient=Gonzalez)")
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        pytest.param(name, method, id=f"{name}-{method}")
+        for i, name in enumerate(SPACES)
+        for method in ((RK4, GAUSS), (MIDPOINT, RK8))[i % 2]
+    ],
 )
-@pytest.mark.parametrize("method", [RK4, RK8, GAUSS, MIDPOINT], ids=str)
-@pytest.mark.parametrize("name", SPACES)
 def test_order_laws_and_constraints(name, method):
     space = SPACES[name]()
     system, x0, T = relaxing(space), start(space), 1.0

@@ -1,4 +1,4 @@
-"""The shared suite: every algebra, dissipation and method, from random states, through the laws at every step."""
+"""The shared suite: every algebra, dissipation and method through the laws at every step."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,18 +12,14 @@ from tests.cases import (
     TRANSCENDENTAL,
     build,
     combinations,
+    covering,
     energy_of,
-    slow_case,
+    kind_of,
     state_of,
     tolerance,
 )
 
 METHODS = list(lt.registered_methods())
-METHOD_PARAMS = [  # of the Gauss methods, whose programs take longest to compile, one stands for all by default
-    pytest.param(method, id=str(method), marks=pytest.mark.slow if costly else ())
-    for method in METHODS
-    for costly in [isinstance(method, lt.MetriplecticGauss) and method.stages != 2]
-]
 STEPS = 40
 STEP = 0.05
 
@@ -63,59 +59,31 @@ def assert_laws(system, solution, method):
 # -- every algebra, every dissipation, every method ---------------------------------------------------------------
 
 
-DEFAULT_ALGEBRAS = """so(3), so(4), sl(2), su(3), sp(2), gl(2), se(3), sl(2) x R^2, heisenberg(1), galilei(2),
-bianchi('V'), bianchi('VI', h=-0.5), bianchi('VII', h=1)"""
-"""Algebras that run in the default tier."""
+def law_cases():
+    """Return algebras with dissipations and methods, so that each pair of a kind of algebra, a dissipation and a method
+    meets."""
+    pairs = [case.values for case in combinations(ALGEBRAS)]
+    places = [(ALGEBRAS.index(g), DISSIPATIONS.index(case)) for g, case in pairs]
+    triples = [(*pair, METHODS[(i + j) % len(METHODS)]) for pair, (i, j) in zip(pairs, places, strict=True)]
+
+    def keys(g, case, method):
+        kind, method = kind_of(g), METHODS.index(method)
+        return (kind, case.name), (case.name, method), (kind, method), (g.name, DISSIPATIONS.index(case) % 3)
+
+    for g, case, method in covering(triples, keys):
+        yield pytest.param(g, case, method, id=f"{g.name}-{case.name}-{method}")
 
 
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize(
-    "g",
-    [g if g.name in DEFAULT_ALGEBRAS else slow_case(g) for g in ALGEBRAS if g.casimir_count() > 0],
-    ids=lambda g: g.name,
+@pytest.mark.sampled(
+    "so(3)-killing-MetriplecticRungeKutta(order=4)",
+    "sl(2)-projected-MetriplecticGauss(stages=2)",
+    "su(2)-projected_preserve-MetriplecticGauss(stages=1)",
+    "heisenberg(1)-potential_power_law-MetriplecticMidpoint(gradient=Gonzalez)",
+    "se(2)-inner_product-MetriplecticMidpoint(gradient=MeanValue)",
+    "su(2)-force-MetriplecticMidpoint(gradient=CoordinateIncrement(symmetric=True))",
 )
-def test_every_algebra(g):
-    system = build(g, next(case for case in DISSIPATIONS if case.name == "projected"))
-    assert_laws(system, run(system, state_of(g, 0)), lt.MetriplecticMidpoint())
-
-
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize(("g", "case"), [*combinations([mf.so(3)]), *map(slow_case, combinations([mf.se(3)]))])
-def test_every_dissipation(g, case):
-    system = build(g, case)
-    for seed in range(3):
-        assert_laws(system, run(system, state_of(g, seed)), lt.MetriplecticMidpoint())
-
-
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize("method", METHOD_PARAMS)
-@pytest.mark.parametrize(
-    "name", ["killing", "projected_preserve", *map(slow_case, ["friction_operator", "double_bracket", "force"])]
-)
-def test_every_method(method, name):
-    g = mf.sl(2)
-    system = build(g, next(case for case in DISSIPATIONS if case.name == name))
-    assert_laws(system, run(system, state_of(g, 1), method, h=STEP / 5), method)
-
-
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("method", METHOD_PARAMS)
-def test_every_method_without_dissipation(method):
-    """The energy and the quadratic Casimirs of a Lie-Poisson system are constant to rounding."""
-    g = mf.se(3)
-    system = lt.LiePoissonSystem(g, energy_of(6, 2))
-    solution = run(system, state_of(g, 2), method)
-    assert solution.audit().energy_drift <= tolerance("energy")
-    assert len(solution.laws.conserved) == 2
-    for name in solution.laws.conserved:
-        assert np.abs(np.diff(solution.casimirs[name])).max() <= tolerance("casimir")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("g", "case"), combinations(ALGEBRAS))
-def test_every_algebra_with_every_dissipation(g, case):
-    """Methods alternate as in a Latin square: each meets every algebra and every dissipation."""
-    method = METHODS[(ALGEBRAS.index(g) + DISSIPATIONS.index(case)) % len(METHODS)]
+@pytest.mark.parametrize(("g", "case", "method"), list(law_cases()))
+def test_every_algebra_dissipation_and_method(g, case, method):
     system = build(g, case)
     if isinstance(method, lt.MetriplecticTaylor):
         # near what is not smooth, such as |f|^1.5 at f = 0, or a pole, no polynomial reaches as far as other steps do
@@ -127,7 +95,20 @@ def test_every_algebra_with_every_dissipation(g, case):
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize("g", [mf.su(3), mf.so(4), mf.sl(2), mf.sl(3), mf.se(3)], ids=lambda g: g.name)
+@pytest.mark.parametrize("method", METHODS, ids=str)
+def test_every_method_without_dissipation(method):
+    """The energy and the quadratic Casimirs of a Lie-Poisson system are constant to rounding."""
+    g = mf.se(3)
+    system = lt.LiePoissonSystem(g, energy_of(6, 2))
+    solution = run(system, state_of(g, 2), method)
+    assert solution.audit().energy_drift <= tolerance("energy")
+    assert len(solution.laws.conserved) == 2
+    for name in solution.laws.conserved:
+        assert np.abs(np.diff(solution.casimirs[name])).max() <= tolerance("casimir")
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("g", [mf.su(3), mf.sl(3), mf.se(3)], ids=lambda g: g.name)
 def test_killing_dissipation_from_random_states(g):
     """On the algebras named in the paper the laws hold at every step, from several states."""
     system = build(g, DISSIPATIONS[0], seed=3)

@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 import liethermo as lt
 import manifolds as mf
 from liethermo.systems.transport import is_torque_free
+from tests.cases import covering
 
 INERTIA = np.array([2.0, 1.0, 2 / 3])
 START = np.array([np.cos(1.1), 0.0, np.sin(1.1)])
@@ -216,22 +217,25 @@ class ZeroVelocityBracket(lt.DoubleBracket):
         return jnp.zeros_like(dH)
 
 
-@pytest.mark.sampled("SE(3)-gauss2", "SL(2)-rk4")
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("name", "method"),
-    [
-        pytest.param(name, method, id=f"{name}-{label}")
-        for name in GROUPS
-        for label, method in {
-            "midpoint": lt.MetriplecticMidpoint(),
-            "gauss2": lt.MetriplecticGauss(2),
-            "gauss3": lt.MetriplecticGauss(3),
-            "rk4": lt.MetriplecticRungeKutta(4),
-            "rk8": lt.MetriplecticRungeKutta(8),
-            "taylor": lt.MetriplecticTaylor(6),
-        }.items()
-        if not method.explicit or name in SURFACE_ORBIT_GROUPS
-    ],
+    covering(
+        (
+            pytest.param(name, method, id=f"{name}-{label}")
+            for name in GROUPS
+            for label, method in {
+                "midpoint": lt.MetriplecticMidpoint(),
+                "gauss2": lt.MetriplecticGauss(2),
+                "gauss3": lt.MetriplecticGauss(3),
+                "rk4": lt.MetriplecticRungeKutta(4),
+                "rk8": lt.MetriplecticRungeKutta(8),
+                "taylor": lt.MetriplecticTaylor(6),
+            }.items()
+            if not method.explicit or name in SURFACE_ORBIT_GROUPS
+        ),
+        lambda name, method: [(name, method.explicit), (method.order, method.explicit), type(method)],
+    ),
 )
 def test_friction_inside_keeps_the_momentum_in_space(name, method):
     """Implicit and explicit methods conserve it in any group that can; the control ignores the friction."""
@@ -391,12 +395,15 @@ UNIT_TEST_METHODS = {
 @pytest.mark.sampled("rk4-compiled-fixed")
 @pytest.mark.parametrize(
     ("method", "kind", "engine", "step"),
-    [
-        pytest.param(method, kind, engine, step, id=f"{name}-{engine}-{how}")
-        for name, (method, kind) in UNIT_TEST_METHODS.items()
-        for engine in ("compiled", "array")
-        for how, step in {"fixed": 0.3, "adaptive": lt.Adaptive(1e-9 if method.order > 2 else 1e-6)}.items()
-    ],
+    covering(
+        (
+            pytest.param(method, kind, engine, step, id=f"{name}-{engine}-{how}")
+            for name, (method, kind) in UNIT_TEST_METHODS.items()
+            for engine in ("compiled", "array")
+            for how, step in {"fixed": 0.3, "adaptive": lt.Adaptive(1e-9 if method.order > 2 else 1e-6)}.items()
+        ),
+        lambda method, kind, engine, step: [(str(method), kind), (type(method), engine, step == 0.3), (kind, engine)],
+    ),
 )
 def test_the_unit_of_momentum_does_not_turn_the_body(method, kind, engine, step):
     """Momenta of 1e20 and of 1e-20 beside attitudes of size 1: a common tolerance would spoil one of them."""

@@ -9,6 +9,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from manifolds.retractions.charts import RETRACTIONS
+from tests.cases import covering
 
 METHODS = {
     "gauss": (lt.MetriplecticGauss, (2,), 1e-5),
@@ -16,9 +17,6 @@ METHODS = {
     "explicit": (lt.MetriplecticRungeKutta, (4,), 1e-5),
 }
 """Class, arguments, and largest error of two steps of 0.02; at most 2e-6 seen, and 1.2e-4 on flags."""
-
-DEFAULT_CASES = {("SO(3)", "projection", "midpoint"), ("S^2", "projection", "midpoint")}
-"""Cases that run in the default tier."""
 
 
 def retraction_names(space) -> list[str]:
@@ -33,25 +31,17 @@ def retraction_names(space) -> list[str]:
     return names
 
 
-def methods_for(kind: str) -> list[str]:
-    """Return all methods for the projection, and one for other retractions: most of the time is compilation."""
-    if kind == "projection":
-        return list(METHODS)
-    return ["midpoint" if kind.startswith("midpoint") else "gauss"]
+def cases():
+    """Return every space with each of its retractions; the projection runs with all methods on some space."""
+    for space in mf.registered_spaces():
+        for kind in retraction_names(space):
+            methods = ["midpoint"] if kind.startswith("midpoint") else ["gauss"]
+            for method in METHODS if kind == "projection" else methods:
+                yield pytest.param(space, kind, method, id=f"{space.name}-{kind}-{method}")
 
 
-CASES = [
-    pytest.param(
-        space,
-        kind,
-        method,
-        id=f"{space.name}-{kind}-{method}",
-        marks=[] if (space.name, kind, method) in DEFAULT_CASES else [pytest.mark.slow],
-    )
-    for space in mf.registered_spaces()
-    for kind in retraction_names(space)
-    for method in methods_for(kind)
-]
+def keys(space, kind, method):
+    return (type(space), kind), space.name, (type(space), method)
 
 
 @pytest.mark.slow
@@ -75,7 +65,8 @@ def gradient_flow(space) -> lt.MetriplecticSystem:
     return lt.MetriplecticSystem(None, energy, dissipation=lt.Friction(), space=space, validate=False)
 
 
-@pytest.mark.parametrize(("space", "kind", "method"), CASES)
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize(("space", "kind", "method"), covering(cases(), keys))
 def test_a_run_in_charts_ends_where_one_without_does(space, kind, method):
     """The steps without charts are ten times as short, and of another method."""
     build, arguments, max_error = METHODS[method]

@@ -12,9 +12,16 @@ import scipy.linalg
 import liethermo as lt
 import manifolds as mf
 from liethermo.runs.flow_derivatives import _inverse_or_nan
+from tests.cases import covering
 from tests.liethermo.integrators.test_convergence import METRIPLECTIC_METHODS, PROBLEMS, SYSTEMS
 
 METHODS = [m for m in lt.registered_methods() if isinstance(m, METRIPLECTIC_METHODS)]
+
+
+def methods_with(names) -> list:
+    """Return methods with names of systems: each method, and each class of methods with each system."""
+    cases = [pytest.param(method, name, id=f"{method}-{name}") for name in names for method in METHODS]
+    return covering(cases, lambda method, name: [(type(method), name), str(method)])
 
 
 def jacobian_by_differences(f, x, size=2e-3):
@@ -35,8 +42,7 @@ UNCONSTRAINED_PROBLEMS = [
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", UNCONSTRAINED_PROBLEMS)
-@pytest.mark.parametrize("method", METHODS, ids=str)
+@pytest.mark.parametrize(("method", "name"), methods_with(UNCONSTRAINED_PROBLEMS))
 def test_along_trajectories(method, name):
     """Both modes are the derivative of the discrete flow, as its differences show."""
     problem, system, h = PROBLEMS[name], SYSTEMS[name](), 0.1
@@ -177,8 +183,7 @@ EQUILIBRIA = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", EQUILIBRIA)
-@pytest.mark.parametrize("method", METHODS, ids=str)
+@pytest.mark.parametrize(("method", "name"), methods_with(EQUILIBRIA))
 def test_at_equilibria(method, name):
     """The Jacobian is that of differences, and the exponential of the field's to the order of the method.
 

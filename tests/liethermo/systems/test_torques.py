@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ from scipy.integrate import solve_ivp
 import liethermo as lt
 import manifolds as mf
 from liethermo.systems.driven import DrivenSystem, _TorqueForce
+from tests.cases import covering
 
 INERTIA = np.array([3.2, 3.0, 1.0])
 START = np.array([0.8, 0.5, 1.3])
@@ -61,7 +64,8 @@ def row(run, law):
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
-    ("torque", "method"), [pytest.param(t, m, id=f"{t}-{m}") for t in TORQUES for m in METHODS], ids=str
+    ("torque", "method"),
+    covering(itertools.product(TORQUES, METHODS), lambda torque, method: [(torque, type(METHODS[method])), method]),
 )
 def test_the_ledger_and_the_impulse(torque, method):
     """Energy and heat less work, and momentum in space less impulse, constant to rounding; the entropy law besides."""
@@ -306,10 +310,18 @@ INTERNAL = {
 }
 
 
-@pytest.mark.sampled("motor-rk4-0.5", "two-gauss2-0.5")
-@pytest.mark.parametrize("step", [0.5, lt.Adaptive(1e-6)], ids=["0.5", "adaptive"])
-@pytest.mark.parametrize("name", METHODS)
-@pytest.mark.parametrize("torque", INTERNAL)
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize(
+    ("torque", "name", "step"),
+    covering(
+        (
+            pytest.param(torque, name, step, id=f"{torque}-{name}-{how}")
+            for torque, name in itertools.product(INTERNAL, METHODS)
+            for how, step in {"0.5": 0.5, "adaptive": lt.Adaptive(1e-6)}.items()
+        ),
+        lambda torque, name, step: [(torque, type(METHODS[name])), (torque, step == 0.5), (name, step == 0.5)],
+    ),
+)
 def test_an_internal_torque_leaves_the_momentum_in_space(torque, name, step):
     """As it leaves the length of the momentum: every method holds both, and the audit has a row for each."""
     system = with_a_wheel(INTERNAL[torque], group=SO3)
