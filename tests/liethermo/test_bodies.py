@@ -32,7 +32,7 @@ def free_body_run(inertia, mu0, t_end, times=None, rate=0.0):
     return solve_ivp(f, (0.0, t_end), start, "DOP853", t_eval=times, rtol=3e-14, atol=1e-15)
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)], ids=str)
 @pytest.mark.parametrize("mu0", [(0.3, 0.2, 1.0), (1.0, 0.3, -0.2), (0.02, 0.0, 1.0)], ids=str)
 def test_periods_against_an_integration(mu0, order):
@@ -165,6 +165,7 @@ def test_a_rod_comes_to_its_flat_spin_in_the_relaxation_time(inertia):
     assert np.tan(angle[-1]) / np.tan(angle[0]) == pytest.approx(np.e, rel=1e-8)
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("middle", [162.75 * (1 - 1e-12), 162.7499, 162.7, 162.0, 155.0, 100.0, 37.5], ids=str)
 @pytest.mark.parametrize("tau", [1.0, 50.0, 5000.0])
 def test_the_relaxation_time_is_an_eigenvalue_of_the_linear_equations(middle, tau):

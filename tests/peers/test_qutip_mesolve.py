@@ -74,7 +74,7 @@ def test_constant_decay(H):
     assert run.audit().passed
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [lt.MetriplecticRungeKutta(4), lt.MetriplecticRungeKutta(8), lt.MetriplecticTaylor(8)], ids=str
 )

@@ -89,7 +89,7 @@ def test_integration(method):
         assert (res.njev, res.nlu) == (0, 0)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_integration_const_jac(method):
     """Errors are measured by the size of the state: SciPy measures each component, which is small near its zero."""
@@ -103,7 +103,7 @@ def test_integration_const_jac(method):
             assert np.all(compute_error(states, sol_linear(times)) < 10)
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 @pytest.mark.parametrize(("direction", "numbers"), [(0, (1, 1)), (1, (1, 0)), (-1, (0, 1))])
 def test_events(method, direction, numbers):
@@ -121,6 +121,7 @@ def test_events(method, direction, numbers):
             assert np.allclose(sol_rational(t), y, rtol=1e-3, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_events_with_a_terminal_one():
     """test_events, third part: the second event would come after the end."""
     end_event = with_attributes(lambda t, y: t - 7.4, terminal=True)
@@ -133,6 +134,7 @@ def test_events_with_a_terminal_one():
     assert np.all(compute_error(res.sol(times), sol_rational(times)) < 5)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("number", [3, 4])
 def test_event_terminal_integer(number):
     res = solve_ivp(OSCILLATOR, (0, 100), [1, 0], events=with_attributes(lambda t, y: y[0], terminal=number))
@@ -333,7 +335,7 @@ def test_tbound_respected_small_interval(method):
     assert res.y[:, -1] == pytest.approx(np.exp([2 * t_end, -2 * t_end]), rel=1e-12)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS[:2], ids=str)
 def test_tbound_respected_oscillator(method):
     """A constant field that is not known after t = 205, in steps as long as the span."""

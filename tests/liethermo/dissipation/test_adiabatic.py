@@ -70,6 +70,7 @@ def test_a_coupling_that_is_not_hermitian_acts_with_its_adjoint():
     np.testing.assert_allclose(velocity, expected, atol=1e-15)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("coupling", "bloch"),
     [
@@ -109,6 +110,7 @@ def test_three_levels_are_those_of_brmesolve():
     np.testing.assert_allclose(rho[[0, 0, 1], [1, 2, 2]], expected, atol=1e-9)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "method", [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4)], ids=str
 )
@@ -190,6 +192,7 @@ def test_a_fast_drive_is_named_by_the_audit():
     assert audit.verdict.endswith("THE EQUATIONS ARE USED WHERE THEY ARE NOT VALID")
 
 
+@pytest.mark.slow
 def test_the_audit_of_an_ensemble_shows_the_worst_adiabatic_parameter():
     """``|H'| / (2 gap^2)`` of a field that turns at the rate w is w / (2 |field|): the weakest field is the worst."""
     field = [(SZ, lambda t: 0.5 * jnp.cos(0.3 * t)), (SX, lambda t: 0.5 * jnp.sin(0.3 * t))]

@@ -53,7 +53,7 @@ def test_every_dissipation_is_a_case_or_has_a_reason():
     assert not missing, f"add a case to DISSIPATIONS in tests/cases.py, or a reason here: {sorted(missing)}"
 
 
-@pytest.mark.sampled(8)
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize(
     ("g", "case"),
     covering(
@@ -85,7 +85,7 @@ def discrete_properties(system, g):
     return float(jnp.max(jnp.abs(energy_residuals))), float(jnp.min(productions))
 
 
-@pytest.mark.sampled(6)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("g", "case"), covering(combinations(REPRESENTATIVE), lambda g, case: [(g.is_semisimple(), case.name)])
 )

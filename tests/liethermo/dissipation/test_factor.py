@@ -142,7 +142,7 @@ HEATING_SYSTEMS = {
 """Systems with friction that heats baths, by name."""
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("make", HEATING_SYSTEMS.values(), ids=HEATING_SYSTEMS)
 def test_divergences_of_heating_systems(make):
     """The closed form of the divergence agrees with differentiation of every column by every component."""
@@ -194,6 +194,7 @@ def motion(t, u):
     ]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("method", "order"),
     [(lt.MetriplecticMidpoint(), 2), (lt.MetriplecticGauss(2), 4), (lt.MetriplecticRungeKutta(4), 4)],
@@ -289,6 +290,7 @@ def _with(baths, conductance):
 test_bad_conductances_are_refused = refusal_test(BAD)
 
 
+@pytest.mark.slow
 def test_bodies_with_baths_conduct_too():
     """A damped rigid body: its two baths come to one temperature, both laws exact."""
     body = lt.LiePoissonSystem(

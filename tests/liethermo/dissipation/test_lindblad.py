@@ -89,6 +89,7 @@ def test_a_drive_in_qutips_form_is_that_of_dop853():
         np.testing.assert_allclose(system.density(run.x[-1]).ravel(), expected_values, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_pure_state_does_not_lower_the_order():
     """From the ground state, where the gradient of the entropy is infinite, at order 6, beside ``mesolve``.
 
@@ -140,6 +141,7 @@ def turning_operator(t, numpy=jnp):
     return LOWER + 0.5 * numpy.exp(1.3j * t) * SX + 0.2j * numpy.cos(t) * SZ
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("method", "error"), [(METHOD, 1e-9), (lt.KrausMethod(4), 1e-6)], ids=["Gauss", "Kraus"])
 def test_jump_operators_that_depend_on_time_are_those_of_dop853(method, error):
     H, rate = 0.5 * SZ + 0.3 * SX, lambda t: 0.2 * (1.5 + jnp.sin(t))
@@ -277,6 +279,7 @@ def current_of(H, rho, pairs) -> float:
     return np.trace(H @ (D @ rho.ravel()).reshape(H.shape)).real
 
 
+@pytest.mark.slow
 def test_local_and_global_dissipation_differ_where_the_coupling_is_weak():
     """Local currents vanish with ``g^2``; global ones do not [Levy & Kosloff 2014; Hofer et al. 2017]."""
     for g in (0.1, 1e-3):

@@ -81,7 +81,7 @@ FAULTS = {
 """Patches that raise an error in a part of the compiler."""
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_of_the_compiler_is_no_fault_of_the_run(fault, monkeypatch, fresh_programs):
     system = lt.LiePoissonSystem(mf.so(3), sine)
@@ -98,6 +98,7 @@ def test_a_fault_of_the_compiler_is_no_fault_of_the_run(fault, monkeypatch, fres
         run(system, "compiled")
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("options", [{"until": lambda m: m[0] + 9.0}, {}], ids=["event", "adaptive"])
 def test_a_fault_where_a_run_has_a_pace(options, monkeypatch, fresh_programs):
     system = lt.LiePoissonSystem(mf.so(3), sine)

@@ -100,7 +100,7 @@ def body(function, dissipation=True):
     )
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("name", "method"),
     [pytest.param(name, METHODS[i % 2], id=f"{name}-{METHODS[i % 2]}") for i, name in enumerate(FUNCTIONS)],
@@ -116,6 +116,7 @@ def test_functions_of_every_kind(name, method):
     assert (np.diff(compiled_run.entropy) > 0.0).all()
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["while_loop", "eigh", pytest.param("inv, larger", marks=pytest.mark.slow)])
 def test_a_lane_is_a_single_run(name):
     """A lane equals a single run to the bit, also if loops of the lanes end at different times."""
@@ -127,6 +128,7 @@ def test_a_lane_is_a_single_run(name):
     assert np.array_equal(ensemble_x, single_x)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["solve", pytest.param("long scan", marks=pytest.mark.slow)])
 def test_newton_has_them_too(name):
     """Newton's method is compiled with these functions, in steps that fixed-point iteration does not solve."""

@@ -94,7 +94,7 @@ def test_an_iteration_is_slow_by_its_last_update_and_by_the_last_two():
     assert slowness_by_update([1.0, 2.0, 4.0, 8.0], 0.6)[1:] == [True] * 3
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("h", [0.05, 0.6])
 def test_spins_in_line_that_a_bath_shakes(h):
     """The bath is corrected a hundred times as much as the spins, in turns: that alone needs no Newton's method."""
@@ -240,6 +240,7 @@ def test_krylov_solves_what_dense_elimination_solves():
     assert not np.asarray(solve_krylov(lambda v: matrix @ v, jnp.zeros(60), DEFAULT_OPTIONS)).any()
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("strength", "length"), [(12.0, 1.0), (0.1, 1e6)], ids=["slow", "large"])
 def test_one_of_many_components_is_solved_like_the_others(strength, length):
     """The root mean square hides no component: a spin that converges slowly, or one that is a million times longer."""

@@ -211,6 +211,7 @@ def test_unknown_names_and_bad_nodes_are_refused():
         lt.MeanValue(nodes=0)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("length", [0.0, 1e-45, 1e-30, 1e-17])
 @pytest.mark.parametrize("stages", [1, 2])
 def test_derivatives_at_stages_of_a_step_that_vanishes(stages, length):

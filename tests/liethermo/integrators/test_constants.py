@@ -43,7 +43,7 @@ def test_a_state_that_relaxes(constant):
     assert np.abs(run.x[-1]).max() <= 1e-20
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", [*EXPLICIT, *IMPLICIT], ids=str)
 @pytest.mark.parametrize("constant", [1e3, 1e4, 1e8])
 @pytest.mark.parametrize("build", [damped_system, oscillator_system])
@@ -76,6 +76,7 @@ def test_a_state_that_vanishes():
     assert np.abs(run.x[-1]).max() <= 1e-150
 
 
+@pytest.mark.slow
 def test_an_entropy_with_a_constant():
     """Explicit steps hold the entropy by its values too, and a constant does not disturb them."""
 
@@ -89,6 +90,7 @@ def test_an_entropy_with_a_constant():
     assert np.abs(run.x - reference.x).max() <= 1e4 * 64 * EPS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", [pytest.param("array", marks=pytest.mark.slow), "compiled"])
 def test_engines_and_adaptive_steps(engine):
     runs = [

@@ -67,7 +67,7 @@ def test_laws_of_a_thousand_systems(g, method):
     assert_laws(random_run(g, 143, 1000, method))
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @each_method
 def test_drift_over_a_hundred_thousand_steps(method):
     assert_no_drift(method, 100_000)
@@ -123,7 +123,7 @@ def test_a_state_that_relaxes_goes_on_at_its_rate(method):
     assert run.audit().passed
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @each_method
 @pytest.mark.parametrize("rate", [0.0, 1e-6, 1.0])
 def test_saddles_and_weak_friction(method, rate):
@@ -221,7 +221,7 @@ def test_fixed_steps_go_on_at_an_equilibrium(case):
         assert lt.integrate(system, x0, (0.0, 2000.0), h, method).audit(energy=2e-15).passed
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [RK(8), RK(6)], ids=str)
 def test_adaptive_steps_on_a_circular_orbit(method):
     """The laws hold though grad H is orthogonal to each step, and grad S depends on the other gradients."""
@@ -249,7 +249,7 @@ def kepler():
     )
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @each_method
 @pytest.mark.parametrize("excess", [0.0, 1e-12, 1e-6, 1e-3, 0.1])
 def test_dependent_gradients(method, excess):
@@ -301,7 +301,7 @@ def test_stiffness_ends_with_advice(method):
     assert adaptive.audit().passed
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @each_method
 def test_adaptive_steps_events_and_output_between(method):
     exact = lt.integrate(BODY, X0, (0.0, 10.0), 10.0, lt.Reference(rtol=1e-13)).x[-1]
@@ -406,6 +406,7 @@ def test_a_step_that_misses_its_levels_fails():
     assert run.status.residual > 1e-10
 
 
+@pytest.mark.slow
 def test_an_energy_is_not_steered_where_the_levels_hardly_meet():
     """At an equilibrium the entropy is maximal for the energy: with one ulp less energy no such state exists."""
     heat = lambda x: jnp.exp(x[0]) + jnp.exp(x[1])  # noqa: E731

@@ -394,6 +394,7 @@ def test_casimirs_whose_gradients_depend_on_each_other():
     assert max(np.ptp(values) for values in run.casimirs.values()) <= 2e-15 * np.dot(x0, x0)
 
 
+@pytest.mark.slow
 def test_a_force_that_heats_a_bath_keeps_the_energy_while_cubic_casimirs_are_projected_off_it():
     g = mf.sl(3)
     system = lt.LiePoissonSystem(

@@ -78,7 +78,7 @@ def reference(system: lt.MetriplecticSystem, x0, T: float) -> np.ndarray:
     return solution.y[:, -1]
 
 
-@pytest.mark.sampled("sphere-MetriplecticRungeKutta(order=4)", "SPD-MetriplecticMidpoint(gradient=Gonzalez)")
+@pytest.mark.sampled("sphere-MetriplecticRungeKutta(order=4)")
 @pytest.mark.parametrize(
     ("name", "method"),
     [
@@ -258,6 +258,7 @@ def spd_matrices():
     return SPDMatrices(2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("space", "theirs"),
     [(mf.Sphere(2), hypersphere), pytest.param(mf.SPD(2), spd_matrices, marks=pytest.mark.slow)],

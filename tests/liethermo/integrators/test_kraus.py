@@ -31,7 +31,7 @@ def test_order_with_a_constant_generator(order):
     assert (orders > order - 0.2).all()
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [2, 4])
 def test_order_with_a_drive_and_rates_that_depend_on_time(order):
     system = lt.QuantumSystem(
@@ -53,7 +53,7 @@ def test_order_with_a_drive_and_rates_that_depend_on_time(order):
     np.testing.assert_allclose(run.casimirs["work"][-1], expected[4].real, atol={2: 2e-4, 4: 2e-7}[order])
 
 
-@pytest.mark.sampled("30.0-4")
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [2, 4])
 @pytest.mark.parametrize("step", [0.3, 3.0, 30.0])
 def test_every_step_is_a_channel(order, step):
@@ -79,6 +79,7 @@ def test_a_method_that_is_no_channel_leaves_the_cone():
     assert row.passed is None
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("outputs", ["final", "trajectory"])
 def test_the_audit_of_an_ensemble_shows_the_least_eigenvalue(outputs, tmp_path):
     """The worst trajectory is the one that starts in the upper level; a quantum channel keeps the others positive."""

@@ -138,7 +138,7 @@ def sine_profile(t):
     return 0.25 * jnp.pi * jnp.sin(0.5 * jnp.pi * t)
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("unit", [1.0, 1e-9])
 @pytest.mark.parametrize("method", EXPLICIT_METHODS, ids=str)
 @pytest.mark.parametrize("step", [0.0625, 0.125])

@@ -217,7 +217,7 @@ class ZeroVelocityBracket(lt.DoubleBracket):
         return jnp.zeros_like(dH)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("name", "method"),
     covering(
@@ -283,7 +283,7 @@ def test_the_momentum_in_space_of_a_body_that_heats_over_every_group(group):
         assert 1e-12 < drifts[1] < 0.3 * drifts[0] < 1e-3
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in GROUPS if name not in SURFACE_ORBIT_GROUPS])
 def test_explicit_methods_conserve_spatial_momentum_to_their_order(name):
     """The audit does not claim more: near orbits of fewer dimensions explicit methods cannot conserve it."""
@@ -320,6 +320,7 @@ def group_reference(system, mu, T):
     return y[n:].reshape(m, m)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("name", "method"),
     [
@@ -360,6 +361,7 @@ def rubbing_body(scale=1.0, kind=None, rate=0.01):
     )
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", [lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(6)], ids=str)
 def test_the_attitude_of_a_rubbing_body(method):
     """The attitude follows SciPy's solution of ``g' = g (xi + rate mu x xi)`` at the order of the method."""
@@ -392,7 +394,7 @@ UNIT_TEST_METHODS = {
 }
 
 
-@pytest.mark.sampled("rk4-compiled-fixed")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "kind", "engine", "step"),
     covering(

@@ -113,7 +113,7 @@ def test_the_estimate_is_right_for_a_linear_oscillation(order):
 # -- orders -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("name", NONLINEAR)
 def test_observed_order(name, order):

@@ -42,6 +42,7 @@ class Power(eqx.Module):
         return m[0] ** self.exponent
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", [*POWERS, "a parameter"])
 def test_whole_powers_as_floats_near_zero(name):
     """Runs agree with DOP853 on Euler's equations in NumPy."""
@@ -70,7 +71,7 @@ def test_quadrature(nodes):
     assert abs(b @ c ** (2 * nodes - 2) - 1.0 / (2 * nodes - 1)) > 1e-16 * 10.0 ** (14 - nodes)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("order", "length"), [(2, 0.1), (5, 0.2), (6, 0.2), (12, 0.3), (20, 0.6)])
 @pytest.mark.parametrize("name", NONLINEAR)
 def test_observed_order(name, order, length):
@@ -203,6 +204,7 @@ def test_without_a_tolerance_the_order_is_that_of_1e_10():
     assert lt.diffrax.Solver(Taylor()).order(None) == 13
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_spins_that_heat_baths(number):
     """The run agrees with the Runge-Kutta method of order 8 and obeys both laws."""

@@ -140,7 +140,7 @@ def forced_system():
     )
 
 
-@pytest.mark.sampled("LieVariational-2.0", "MetriplecticGauss(stages=2)-4.0")
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("method", "order"),
     [
@@ -183,7 +183,7 @@ def test_su3_by_the_exponential():
     assert np.abs(g[-1] @ g[-1].conj().T - np.eye(3)).max() < 1e-13
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "R", [0.2, [0.2, 0.1, 0.3], [[0.2, 0.1, 0.0], [-0.1, 0.3, 0.0], [0.0, 0.0, 0.1]]], ids=["number", "array", "matrix"]
 )

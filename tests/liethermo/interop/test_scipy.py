@@ -70,6 +70,7 @@ def assert_same_events(theirs, ours, tolerance=1e-8):
             assert np.abs(our_values - peer_values.reshape(our_values.shape)).max(initial=0.0) < tolerance
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("direction", [-1, 0, 1])
 def test_events_are_those_of_scipy(direction):
     events = [_event(f, direction=direction) for f in (crossing_event, oscillating_event)]
@@ -84,7 +85,7 @@ def test_events_are_those_of_scipy(direction):
 TIMES = np.linspace(*SPAN, 50)
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", [None, lt.MetriplecticGauss(3), lt.MetriplecticRungeKutta(4)], ids=str)
 @pytest.mark.parametrize("rtol", [1e-6, 1e-9])
 def test_events_are_zeros_and_as_accurate_as_asked_and_the_laws_hold_there(rtol, method):
@@ -108,6 +109,7 @@ def test_several_zeros_in_a_step_are_found():
     assert np.abs(coarse_run.t_events[0] - theirs.t_events[0]).max() < 1e-4
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("terminal", [True, 2, 3])
 def test_terminal_events_end_the_run_at_their_zeros(terminal):
     """Other events are kept up to the terminal one, whose state is the last."""
@@ -123,6 +125,7 @@ def test_terminal_events_end_the_run_at_their_zeros(terminal):
     assert np.array_equal(ours.sol(ours.t[-1]), ours.y[:, -1])
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("terminal", [False, True])
 def test_events_at_both_ends(terminal):
     """Zeros exactly at the end or at the start count as in SciPy, and an end of a step counts once."""
@@ -135,7 +138,7 @@ def test_events_at_both_ends(terminal):
     assert sampled_run.t_events[0].tolist() == [3.0]
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("width", [1e-6, 1e-3, 0.02, 0.5])
 def test_a_function_that_is_not_a_number_has_no_zero_there(width):
     """The NaN interval may be wider than the steps, or so narrow that only the search meets it."""
@@ -169,6 +172,7 @@ def test_events_in_the_first_step_of_a_driven_system(direction):
     assert_same_events(theirs, ours, 1e-6)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "events", [lambda t, y: y[1] * 0.0, lambda t, y: min(t - 1.0, 0.0) if t else 0.0], ids=["zero", "nearly"]
 )
@@ -207,6 +211,7 @@ def test_a_state_between_steps_that_cannot_be_found_is_an_error(monkeypatch):
         run([0.5, 0.75])
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("width", [1e-6, 0.5, 3.0])
 def test_the_message_says_where_a_function_is_not_a_number(width):
     """A sign change across NaN values may or may not be a zero, so it is reported."""

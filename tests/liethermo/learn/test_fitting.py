@@ -56,6 +56,7 @@ def test_other_parameters_of_any_system_are_found():
     assert float(fitted_system.dissipation.rate) == pytest.approx(float(body.dissipation.rate), rel=1e-2)
 
 
+@pytest.mark.slow
 def test_a_network_learns_the_force_and_the_laws_hold_in_the_forecast():
     t, x = cases.record(8)
     energy = lt.Quadratic(np.ones(1)).on([1]) + lt.learn.Energy(1, width=8, depth=1).on([0]) + _Heat().on([2])
@@ -99,6 +100,7 @@ def test_the_same_twice_and_on_from_a_checkpoint(tmp_path, monkeypatch):
         lt.learn.fit(system, (t, x), checkpoint=path, **{**how, "rate": 0.06})
 
 
+@pytest.mark.slow
 def test_units_make_no_difference():
     """Seconds or 1e-12 of them, metres or 1e12 of them: the losses are the same but for rounding."""
     t, x = cases.record(3, 21)
@@ -110,6 +112,7 @@ def test_units_make_no_difference():
     np.testing.assert_allclose(results[1:], [results[0]] * 2, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_what_is_not_observed_is_known_through_the_laws():
     """The heat is not seen: the stiffness and the friction on the motion are found all the same."""
     t, x = cases.record(3, 31, 3.0)
@@ -133,6 +136,7 @@ class _Drag(cases.Rubbing):
         return jnp.stack([0.0, 0.0, -jnp.exp(0.5 * self.log_gamma)])
 
 
+@pytest.mark.slow
 def test_noise_and_times_at_any_distances():
     t, x = cases.record(4, 81)
     random = np.random.default_rng(1)

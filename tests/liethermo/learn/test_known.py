@@ -38,6 +38,7 @@ def test_a_constant_of_the_energy_is_not_determined():
     assert difference == pytest.approx(1.0, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_network_is_determined_where_the_data_are():
     system = cases.oscillator(energy=lt.learn.Energy(3, width=8, depth=1), friction=None)
     x = np.random.default_rng(0).standard_normal((6, 3))

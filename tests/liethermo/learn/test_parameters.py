@@ -89,6 +89,7 @@ def coverage(seeds, motion):
     return np.array(contains), np.array(errors)
 
 
+@pytest.mark.slow
 def test_intervals_of_three_throws_contain_the_ratios():
     contains, errors = coverage(range(3), SHORT_MOTION)
     assert contains.sum(axis=0).min() >= 2
@@ -272,6 +273,7 @@ def test_a_frame_and_its_arrays_give_one_fit():
     np.testing.assert_allclose(name_fit.values, order_fit.values, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_an_observation_may_depend_on_the_attitude_and_a_parameter():
     """A camera that is mounted at an unknown distance sees two marks on a body of unknown inertias."""
     marks, inertia = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]).T, (1.0, 2.0, 2.5)

@@ -85,6 +85,7 @@ def test_the_rate_and_its_error_are_those_of_least_squares():
     assert result.problems == []
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_friction_is_found_where_the_noise_is_not_given(seed):
     """The friction was 0.28 and 0.10 for a true 0.15: splines through noisy data have its derivatives."""
@@ -97,6 +98,7 @@ def test_the_friction_is_found_where_the_noise_is_not_given(seed):
     assert "estimated" in str(fitted_system)
 
 
+@pytest.mark.slow
 def test_two_observed_components_determine_it_too():
     """The friction was 0.184: the descent had not come to its end, and nothing said so."""
     data = [(t, x[:, :2]) for t, x in records(0)]
@@ -187,6 +189,7 @@ def test_data_without_noise_can_be_said_to_be_exact():
     assert "norm of the gradient" in str(exact.training)
 
 
+@pytest.mark.slow
 def test_trajectories_of_any_lengths_and_attitudes():
     """The rest of a shorter trajectory is left out; what is not finite there does no harm."""
     data = [(t[: 81 - 20 * i], x[: 81 - 20 * i]) for i, (t, x) in enumerate(records(2))]
@@ -196,6 +199,7 @@ def test_trajectories_of_any_lengths_and_attitudes():
     assert fitted_system.standard_errors == pytest.approx([error], rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [2, pytest.param(8, marks=pytest.mark.slow)])
 def test_fits_to_few_trajectories_spread_as_their_errors(number):
     """Three trajectories were drawn again and again, and the deviation was 0.0."""
@@ -234,6 +238,7 @@ def test_the_findings_come_back_from_a_file(tmp_path):
     assert len(jax.tree_util.tree_leaves(fitted_system)) == len(jax.tree_util.tree_leaves(spring(1.0)))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("shift", "std", "is_negligible"),
     [

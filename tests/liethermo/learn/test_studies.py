@@ -17,6 +17,7 @@ def _study(system, axes, **how):
     return lt.Study(system, axes, t_span=(0.0, 1.0), step=0.1, measure={"final": "final"}, **how)
 
 
+@pytest.mark.slow
 def test_a_fitted_system_is_studied_and_its_study_goes_on_with_the_one_from_the_file(tmp_path):
     t, x = cases.record(2, 21)
     fitted_system = lt.learn.fit(cases.oscillator(), (t, x), matching=50, shooting=0)

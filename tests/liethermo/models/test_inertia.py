@@ -33,6 +33,7 @@ BUILDERS = {
 MODELS = [*BUILDERS][:8]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", MODELS)
 def test_a_tensor_is_the_body_in_turned_axes(name):
     """The angular momentum of a body is that of the same body in principal axes, turned."""

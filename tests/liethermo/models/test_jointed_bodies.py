@@ -187,6 +187,7 @@ def test_cat_turns_over_without_angular_momentum():
     assert run.audit().passed
 
 
+@pytest.mark.slow
 def test_motor_inside_changes_no_momentum_and_its_work_is_in_the_balance():
     tree = tree_of(BODIES, NAMES, damping=0.0)
     system = tree.system(motors={"panel": lambda t: 0.4 * jnp.sin(t)})

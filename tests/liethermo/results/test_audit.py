@@ -191,7 +191,7 @@ def kepler_positions(e, t):
     return np.stack([np.cos(u) - e, np.sqrt(1.0 - e * e) * np.sin(u)], axis=1)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("method", "e", "n_steps", "save_every", "is_resolved"),
     [
@@ -219,6 +219,7 @@ def test_the_audit_finds_the_steps_past_the_centre(method, e, n_steps, save_ever
     assert solution.evidence.error_time == pytest.approx(np.pi, abs=0.2)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("save_every", [1, 6])
 def test_the_audit_finds_a_step_through_a_barrier(save_every):
     """The barrier is a twentieth of a step wide, and twice as high as would stop the particle."""
@@ -233,6 +234,7 @@ def test_the_audit_finds_a_step_through_a_barrier(save_every):
     assert fine_solution.audit().resolved
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("save_every", [1, 40])
 def test_the_verdict_says_how_many_steps_were_looked_at(monkeypatch, save_every):
     """The verdict tells the number of checked steps, which are those where the motion is fastest."""
@@ -352,6 +354,7 @@ def test_consistency_is_judged_by_short_steps(method, is_consistent):
     assert is_consistent or row.value == pytest.approx(1e-3, rel=0.01)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("outputs", ["trajectory", "final", "summary"])
 def test_an_ensemble_reports_an_entropy_that_should_be_constant(outputs):
     """The midpoint scheme keeps quadratic Casimirs only; one run and an ensemble both say that the entropy changes."""
@@ -377,6 +380,7 @@ class WrongClaim(lt.OneStepMethod):
         return h * k[0]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("outputs", ["trajectory", "final"])
 @pytest.mark.parametrize(("method", "passes"), [(lt.MetriplecticMidpoint(), True), (WrongClaim(), False)])
 def test_an_ensemble_reports_the_drift_of_functions_that_should_be_constant(outputs, method, passes):
@@ -408,6 +412,7 @@ def test_what_the_method_does_not_promise():
     assert solution.laws.unpromised == ("cube",)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("rate", [1e-13, 1.0, 1e13])
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
 def test_slow_friction_is_friction_still(rate, scale):

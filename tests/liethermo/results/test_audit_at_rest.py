@@ -35,7 +35,7 @@ def test_the_heat_of_a_wheel_at_rest_is_rounding(method, attitude):
     assert attitude or solution.evidence.inconsistency is None  # nothing moves
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("nutation", [1e-3, 1e-9])
 @pytest.mark.parametrize(
     ("method", "is_consistent"),
@@ -82,7 +82,7 @@ def system_with_drag(name):
     return system, [1.0, 0.0], lambda t, x: np.array([x[1], force(x[0]) - 0.3 * x[1]])
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("step", [0.05, lt.Adaptive(1e-8)], ids=["fixed", "adaptive"])
 @pytest.mark.parametrize(
     "method", [lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4), lt.MetriplecticTaylor(10)], ids=str

@@ -271,7 +271,7 @@ def exact_states(name):
 CASE_IDS = [f"{system}-{method}" for system in SYSTEMS for method in METHODS]
 
 
-@pytest.mark.sampled("so(3)-RK8", "attitude-RK4")
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("case", CASE_IDS, ids=CASE_IDS)
 def test_the_order_and_the_laws_of_the_method_hold_between_its_steps(case):
     name, method = case.split("-")
@@ -301,6 +301,7 @@ def test_control_the_cubic_between_has_an_order_of_its_own():
     assert np.log2(errors[0] / errors[1]) < 5.0
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("engine", ["compiled", "array"])
 def test_states_between_adaptive_steps(engine):
     """Dense output of adaptive steps takes times of any shape, refuses extrapolation, and is NaN if a step fails."""

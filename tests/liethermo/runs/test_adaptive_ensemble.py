@@ -77,6 +77,7 @@ def test_engines_take_the_same_steps():
     assert np.abs(one.x[-1] - a.x[3]).max() < 1e-11
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_trajectory_does_not_depend_on_its_neighbours(engine, monkeypatch):
     """Permuted, cut into other portions, in more threads, with fewer attempts in a call: the same to the last bit."""
@@ -99,6 +100,7 @@ def test_a_trajectory_does_not_depend_on_its_neighbours(engine, monkeypatch):
     assert_same_ensembles(default_run, run(np.arange(41)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_stiff_failing_and_early_ones_together(engine):
     """One needs Newton's method, one leaves its domain, one rests, one starts beside a saddle, one cannot start."""
@@ -129,6 +131,7 @@ def test_stiff_failing_and_early_ones_together(engine):
     assert all(is_obeyed is not False for law, is_obeyed in rows.items() if law != "accuracy")
 
 
+@pytest.mark.slow
 def test_limits():
     x0s = np.array([[0.1, 1.0, 0.1], [1.0, 0.0, 0.0]])
     ensemble = lt.ensemble(BODY, x0s, (0.0, 50.0), lt.Adaptive(1e-8, most_steps=20), METHOD)
@@ -156,6 +159,7 @@ def test_save_at(engine):
         assert one.stats.steps == ensemble.steps[i]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-8)])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_events_happen_when_they_do_alone(engine, step):
@@ -262,6 +266,7 @@ def test_bad_input(arguments, message):
         lt.ensemble(**(default | arguments))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["compiled", "array"])
 def test_the_accuracy_of_an_audit_is_that_of_an_accepted_step(engine):
     """The first size that is tried is much too long, and is no step of the run."""

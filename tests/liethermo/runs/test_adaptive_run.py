@@ -50,7 +50,7 @@ SIZES = {1: 0.1, 2: 0.4, 3: 0.6, 4: 1.0}
 # -- adaptive steps ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("stages", "rtol"), [(1, 1e-4), (2, 1e-4), (2, 1e-7), (3, 1e-4), (3, 1e-7), (3, 1e-10), (4, 1e-7), (4, 1e-10)]
 )
@@ -119,6 +119,7 @@ def test_steps_do_not_chatter():
     assert np.abs(np.diff(np.log(steps))).max() < np.log(3.1)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("explicit", [False, True])
 def test_control(explicit):
     """On an error that follows h^(order + 1) the step tends to the one with the error aimed at, and stays."""
@@ -145,6 +146,7 @@ def test_control(explicit):
     assert float(step_size_after_rejection(np.inf, proposed_step, power)) == 0.25 * proposed_step
 
 
+@pytest.mark.slow
 def test_attempts_together_are_attempts_one_by_one(monkeypatch):
     """Rejected ones among them."""
 

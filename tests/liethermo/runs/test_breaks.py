@@ -69,7 +69,7 @@ def body_with_undeclared_pulses():
     return lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1.0 / INERTIA), torque=undeclared_pulses)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("method", "step", "max_error"), METHODS, ids=str)
 def test_thruster_pulses_are_integrated_to_the_tolerance(body, reference, method, step, max_error):
     solution = lt.integrate(body, X0, (0.0, END), step, method)
@@ -104,6 +104,7 @@ def test_saved_times_and_breaks_are_kept_apart(body, reference):
     assert every_third.audit().passed
 
 
+@pytest.mark.slow
 def test_flow_has_the_states_and_derivatives_of_the_run(body, reference):
     import jax
 
@@ -151,7 +152,7 @@ def switched_reference():
     return m, work
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("is_right_continuous", [True, False])
 @pytest.mark.parametrize(
     ("method", "step", "max_error"),
@@ -175,6 +176,7 @@ def test_jump_of_the_energy_is_work(switched_reference, method, step, max_error,
     assert np.ptp(solution.energy - solution.casimirs["work"]) < (1e-11 if isinstance(method, lt.Reference) else 1e-14)
 
 
+@pytest.mark.slow
 def test_energy_states_its_breaks(switched_reference):
     def drive(m, t):
         return jnp.where((t >= 1.0) & (t < 3.0), 2.0, 0.0) * m[2] * m[0]
@@ -218,6 +220,7 @@ def test_steps_of_given_size_warn_and_the_advice_helps(reference):
     assert np.abs(advised.x[-1] - reference).max() < 1e-11
 
 
+@pytest.mark.slow
 def test_short_pulse_on_a_spin_at_rest_is_not_skipped():
     width = 0.02
 
@@ -238,6 +241,7 @@ def test_short_pulse_on_a_spin_at_rest_is_not_skipped():
         assert np.abs(solution.x[-1] - m).max() < 1e-7
 
 
+@pytest.mark.slow
 def test_smooth_drives_have_no_features():
     """A control: a slow field, a fast one and a ramp are no features, and a run with breaks there is the same run."""
     for drive in (jnp.sin, lambda t: jnp.sin(50.0 * t), lambda t: 0.1 * t):
@@ -251,7 +255,7 @@ def test_smooth_drives_have_no_features():
 # -- errors of quadratures ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("frequency", [1.0, 10.0])
 @pytest.mark.parametrize(
     "method", [*map(lt.MetriplecticRungeKutta, (4, 6, 8)), lt.MetriplecticTaylor(), lt.MetriplecticGauss(3)], ids=str
@@ -318,6 +322,7 @@ def body_with_table(kind="linear"):
     return lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1.0 / INERTIA), torque=lt.torques.Tabulated(KNOTS, MOMENTS, kind))
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("method", "step", "max_error"), METHODS, ids=str)
 def test_steps_end_at_the_times_of_a_linear_table(reference_with_table, method, step, max_error):
     run = lt.integrate(body_with_table(), X0, (0.0, END), step, method)
@@ -326,6 +331,7 @@ def test_steps_end_at_the_times_of_a_linear_table(reference_with_table, method, 
     assert run.audit().passed or isinstance(method, lt.Reference)  # whose energy has the error of its steps
 
 
+@pytest.mark.slow
 def test_a_step_across_a_kink_would_lose_the_order(reference_with_table):
     """The control: the same values as a function that declares nothing."""
 
@@ -337,6 +343,7 @@ def test_a_step_across_a_kink_would_lose_the_order(reference_with_table):
     assert np.abs(run.x[-1] - reference_with_table).max() > 1e-8
 
 
+@pytest.mark.slow
 def test_times_of_a_table_that_are_no_stops(reference_with_table):
     """A table finer than the steps, one whose pieces are smooth, and one with more than the largest number of times."""
     method = lt.MetriplecticGauss(2)
@@ -351,6 +358,7 @@ def test_times_of_a_table_that_are_no_stops(reference_with_table):
     assert run.stats.steps < 1000
 
 
+@pytest.mark.slow
 def test_tables_in_ensembles(reference_with_table):
     body, method = body_with_table(), lt.MetriplecticRungeKutta(6)
     scales = np.array([1.0, 0.5])

@@ -28,11 +28,7 @@ def two_levels_and_one(x):
 FIRST_EVENT_TIME = np.arccos(-0.8)
 
 
-@pytest.mark.sampled(
-    "MetriplecticGauss(stages=3)-two_levels-compiled",
-    "MetriplecticRungeKutta(order=8)-two_levels_and_one-compiled",
-    "MetriplecticTaylor(order=20)-two_levels_and_one-compiled",
-)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("engine", ["compiled", "array"])
 @pytest.mark.parametrize("until", [two_levels, two_levels_and_one])
 @pytest.mark.parametrize("method", METHODS, ids=str)
@@ -57,6 +53,7 @@ def test_control_without_looks_a_later_one_is_taken_for_the_first(monkeypatch):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [METHODS[1], pytest.param(METHODS[2], marks=pytest.mark.slow)], ids=str)
 def test_a_body_that_relaxes_for_a_moment_is_relaxed(method):
     """The entropy production falls below the limit, rises again within a step or two, and falls for good later."""
@@ -95,7 +92,7 @@ def run_until(until, step, engine="compiled", order=8, noise_size=1e-13):
     return solution
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("step", [lt.Adaptive(1e-8), 0.1])
 @pytest.mark.parametrize("order", [4, 6, 8])
@@ -117,7 +114,7 @@ JUMPS = {
 }
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("name", JUMPS)
 @pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-8)])
@@ -141,7 +138,7 @@ ZEROS = {
 }
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("name", ZEROS)
 @pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-8)])
@@ -197,7 +194,7 @@ def test_an_event_that_comes_and_goes_within_a_step_is_seen(method):
     assert np.abs(ensemble.event_time - solution.event_time).max() < 1e-12
 
 
-@pytest.mark.sampled("adaptive-compiled-gauss", "fixed-compiled-rk8")
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", [lt.MetriplecticGauss(2), METHODS[1]], ids=["gauss", "rk8"])
 @pytest.mark.parametrize("engine", ["compiled", "array"])
 @pytest.mark.parametrize("step", [pytest.param(0.1, id="fixed"), pytest.param(lt.Adaptive(1e-9), id="adaptive")])
@@ -229,6 +226,7 @@ def rubbing(point):
     return lt.LiePoissonSystem(mf.so(3), lt.Quadratic([0.3, 0.5, 1.0]), dissipation=lt.DoubleBracket(point["rate"]))
 
 
+@pytest.mark.slow
 def test_a_study_of_bodies_whose_energy_falls():
     """The time is inverse to the rate, but for where the motion has turned the body."""
     study = lt.Study(
@@ -269,6 +267,7 @@ def velocity(x):
 TURN = 2.0 * np.pi
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("engine", ["compiled", pytest.param("array", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("step", [lt.Adaptive(1e-10), 0.1], ids=str)
 def test_several_events_beside_their_exact_times(step, engine):
@@ -352,6 +351,7 @@ def test_events_of_attitude_parameters_and_system():
         lt.integrate(oscillator(), [1.0, 0.0], (0.0, 1.0), 0.1, until=lambda x, attitude: x[0])
 
 
+@pytest.mark.slow
 def test_functions_of_numpy_and_of_python():
     """The functions that jax.numpy has are traced; others are called by the array engine, in runs and in ensembles."""
 

@@ -83,6 +83,7 @@ def test_a_batch():
     assert np.abs(ends - single_runs).max() < 1e-13
 
 
+@pytest.mark.slow
 def test_newton_is_compiled_where_a_step_needs_it(monkeypatch):
     """Newton's method is two thirds of a program, and not in that of a derivative, whose slopes are known."""
 
@@ -197,7 +198,7 @@ MODELS = {
 HEAVY = ("body_with_wheels", "gas_piston", "cylinder", "mass_spring_gas")
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow) if name in HEAVY else name for name in MODELS]
 )
@@ -376,6 +377,7 @@ def test_derivatives_found_at_once(order, monkeypatch):
     assert np.abs(through).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_linearised_flow_in_another_program():
     """The residuals of a linearised flow can be a part of any program."""
     x, v = X0, jnp.array([0.1, -0.2, 0.3])

@@ -33,6 +33,7 @@ def reference(times, moments=(3.0, 2.0, 1.0), rate=0.3, x0=X0):
     return result.y.T[np.argsort(np.argsort(times))]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", [lt.MetriplecticGauss(3), lt.MetriplecticRungeKutta(6)], ids=["gauss", "explicit"])
 def test_states_at_irregular_times_are_those_of_dop853(method):
     states = lt.flow(rigid_body(), X0, (0.0, 2.0), 0.1, method, save_at=TIMES)
@@ -79,6 +80,7 @@ def test_derivatives_by_parameters_times_and_states_are_those_of_differences():
     np.testing.assert_allclose(gradient[2], jnp.einsum("ij,ijk->k", 3 * values**2, by_time), rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_times_and_parameters_can_be_mapped():
     def build(rate, times):
         return lt.flow(lambda r: rigid_body(rate=r), X0, (0.0, 2.0), 0.2, save_at=times, parameters=rate)
@@ -90,6 +92,7 @@ def test_times_and_parameters_can_be_mapped():
     assert np.isnan(jax.jit(lambda t: build(0.1, t))(jnp.array([2.5]))).all()
 
 
+@pytest.mark.slow
 def test_a_driven_system_has_its_own_clock():
     moment = lt.TimeDependent(lambda x, t: 0.5 * jnp.sum(x**2 / jnp.array([3.0, 2.0, 1.0])) + jnp.sin(t) * x[0])
     system = lt.LiePoissonSystem(mf.so(3), moment)
@@ -104,6 +107,7 @@ def test_a_driven_system_has_its_own_clock():
     np.testing.assert_allclose(states, result.y.T[np.argsort(np.argsort(TIMES))], atol=2e-9)
 
 
+@pytest.mark.slow
 def test_a_fit_to_a_table_finds_its_parameters():
     times = np.sort(np.random.default_rng(0).uniform(0.0, 2.0, 12))
     table = reference(times, rate=0.42)

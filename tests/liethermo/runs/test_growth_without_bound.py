@@ -31,7 +31,7 @@ def steep():
     return lt.MetriplecticSystem(mf.Canonical(1), lambda x: 0.5 * x[1] ** 2 - 0.25 * x[0] ** 4), 10.0, 0.01
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("case", "method", "adaptive"),
     [
@@ -81,6 +81,7 @@ def test_ensembles_that_overflow_raise_no_warnings(engine, tmp_path):
     assert loaded_run.message(0) == ensemble.message(0)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("step", [0.05, lt.Adaptive(1e-6)], ids=["equal", "adaptive"])
 def test_ensembles_say_what_has_grown(step):
     system, end, _ = cubic()

@@ -24,6 +24,7 @@ X0 = [0.001, 1.0, 0.001]
 # -- times and saving ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("end", "h", "steps"), [(1.0, 0.1, 10), (100.0, 0.1, 1000), (1.05, 0.1, 11), (0.05, 0.1, 1), (0.3, 0.1, 3)]
 )
@@ -147,7 +148,7 @@ def test_no_smaller_step_is_advised_where_none_helps(monkeypatch):
     assert "do not help" in solution.status.message
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("x0", [[1.0, 20.0, 0.1], [5.0, 100.0, 5.0]])
 @pytest.mark.parametrize("h", [1.0, 20.0, 50.0, 1e3])
 def test_huge_steps_solve_their_equation(h, x0):
@@ -281,7 +282,7 @@ def leaves_its_domain_with_attitude(torque=None):
     )
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", [lt.MetriplecticRungeKutta(4), lt.MetriplecticTaylor(6), lt.MetriplecticGauss(2)])
 @pytest.mark.parametrize(
     "torque", [None, lt.torques.ConstantInBody([0.3, 0.0, 0.0]), lt.torques.ConstantInSpace([0.3, 0.0, 0.0])]
@@ -306,6 +307,7 @@ def test_the_body_of_the_readme_in_steps_that_are_too_long():
     assert lt.integrate(body, [0.6, 1.0, 10.0], (0.0, 10.0), 0.01, **options).status.ok
 
 
+@pytest.mark.slow
 def test_a_potential_with_a_logarithm_on_se3_in_a_step_that_is_too_long():
     system = lt.LiePoissonSystem(mf.se(3), lambda mu: 0.5 * mu @ mu + jnp.log(mu[0]), group=mf.SE(3))
     x0 = [1e-3, 0.5, 0.2, 0.3, 0.1, 0.2]

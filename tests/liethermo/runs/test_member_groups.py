@@ -48,7 +48,7 @@ def field(a):
     return rate
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_members_are_as_if_alone(method):
     single_runs = np.array([lt.integrate(body({"a": a}), START, SPAN, STEP, method).x[-1] for a in A])
@@ -63,6 +63,7 @@ def test_members_are_as_if_alone(method):
     assert ensemble[0].audit().passed
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", [lt.MetriplecticMidpoint(), lt.MetriplecticRungeKutta(6)], ids=str)
 def test_adaptive_steps_and_saved_times(method):
     options = {"parameters": {"a": A}, "save_at": [0.5, 2.0]}
@@ -72,6 +73,7 @@ def test_adaptive_steps_and_saved_times(method):
         assert np.abs(ensemble.x[i] - one.x).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_named_parameters():
     system = lt.LiePoissonSystem(
         mf.so(3), lt.Quadratic(np.eye(3)), lambda m: jnp.log(1 + m @ m), lt.KillingDissipation(0.3)
@@ -82,6 +84,7 @@ def test_named_parameters():
     assert np.abs(ensemble.x - single_runs.x).max() < 1e-14
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", METHODS[2:], ids=str)
 def test_an_isotropic_body_does_not_stop_the_others(method):
     """The steps of the others cannot end on its levels: they were not converged."""
@@ -91,6 +94,7 @@ def test_an_isotropic_body_does_not_stop_the_others(method):
     assert ensemble.audit().passed
 
 
+@pytest.mark.slow
 def test_a_point_of_a_study():
     axes = {"a": [1.0, 0.5, 2.0]}
     study = lt.Study(body, axes, x0=START, t_span=SPAN, step=STEP, measure={"x": "final"})
@@ -139,6 +143,7 @@ def asymmetric_body(p):
     return lt.LiePoissonSystem(mf.so(3), lambda m: 0.5 * (m[0] ** 2 + p["b"] * m[1] ** 2) + m[2] ** 2)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", [lt.MetriplecticGauss, lt.MetriplecticRungeKutta])
 def test_what_a_member_does_not_conserve_is_not_held(method):
     holding = method(4, preserve=[lambda m: m[2]])
@@ -150,6 +155,7 @@ def test_what_a_member_does_not_conserve_is_not_held(method):
     assert ensemble.status.tolist() == [StatusCode.INADMISSIBLE, StatusCode.COMPLETED]
 
 
+@pytest.mark.slow
 def test_a_preserved_function_that_is_a_casimir_of_one_member():
     """``x A x`` is a multiple of the Casimir for A = 1 alone: each member names what its friction preserves."""
 
@@ -223,6 +229,7 @@ def test_groups_are_few_and_in_order():
     assert len(names[1]) == 1
 
 
+@pytest.mark.slow
 def test_an_interruption_stops_all_groups(monkeypatch):
     from liethermo.runs.ensemble_lanes import FixedEnsembleRun
 

@@ -32,6 +32,7 @@ def family():
 # -- one of them ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("outputs", ["final", "trajectory"])
 def test_a_member_is_the_solution_of_its_own_run(family, outputs):
     ensemble = lt.ensemble(build, states(7), SPAN, STEP, parameters=family, outputs=outputs, save_every=5)
@@ -84,7 +85,7 @@ def test_members_with_attitudes_and_with_work(outputs):
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("outputs", ["final", "trajectory", "summary"])
 def test_save_and_load(tmp_path, outputs):
     x0s = states(5)
@@ -136,6 +137,7 @@ def test_xarray():
 # -- which cannot be started ---------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("is_named", [True, False])
 def test_inadmissible_parameters_are_a_status_of_their_member(is_named):
     """Three of a thousand, one of them not a number; the others are what they are without them."""

@@ -135,6 +135,7 @@ def test_terms_that_cancel_in_the_energy(method):
         assert np.abs(solution.x[-1] / x0[1] - swing).max() < (1e-6 if method.order == 4 else 0.01)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("stages", "max_error"), [(2, 1e-6), (3, 1e-10)])
 def test_a_driven_body_that_comes_to_rest_stays_where_its_torque_leaves_it(stages, max_error):
     """``L' = sin t`` from rest: at t = 2 pi the energy is zero and the work, rounded, is not."""

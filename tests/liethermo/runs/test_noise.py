@@ -156,6 +156,7 @@ def _record_calls(call, names: list):
     return recording_call
 
 
+@pytest.mark.slow
 def test_newton_where_the_fixed_point_is_too_far():
     """Noise so large that fixed-point iteration fails; both engines solve the same equation."""
     noise = lt.Fluctuations(6.0, 0)

@@ -239,7 +239,7 @@ CASES = BuiltOnUse(
 )
 
 
-@pytest.mark.sampled("spin")
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_equilibria_with_the_volume_of_the_space(name):
     """``exp(-H / (k T))``, or ``exp(S / k)`` on the level of H, times Riemannian volume."""
@@ -252,6 +252,7 @@ def test_equilibria_with_the_volume_of_the_space(name):
     check_equilibrium(system, noise, start, 12.0, 0.02, paths=1000, samples=(points, weights))
 
 
+@pytest.mark.slow
 def test_noise_moves_a_state_far_on_a_surface_of_no_degree():
     """The energy cannot be changed along its gradient where it is least: noise has no law of the energy to hold."""
     system, noise, samples, _ = CASES["ring"]

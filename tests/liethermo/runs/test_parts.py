@@ -57,7 +57,7 @@ NOISY = BuiltOnUse(
 )  # fmt: skip
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("engine", ["compiled", pytest.param("array", marks=ARRAY)])
 @pytest.mark.parametrize("name", NOISY)
 def test_a_noisy_run_in_parts_is_the_run_to_the_bit(name, engine):
@@ -115,6 +115,7 @@ def test_a_noisy_ensemble_in_parts(engine):
     assert engine == "array" or np.array_equal(single_runs.x[-1], whole_run.x[4])
 
 
+@pytest.mark.slow
 def test_a_noisy_study_in_parts():
     """Replicas have seeds of their own; a study that starts where another one ended goes on with them."""
 
@@ -174,7 +175,7 @@ def test_energy_and_casimirs_of_noisy_runs_do_not_drift(name):
 # -- the names of steps ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.sampled(12)
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("step", [0.1, 1e-3, 0.05, 1 / 3, 0.7, 1e6 / 7])
 @pytest.mark.parametrize("offset", [0.0, 0.5, 0.25, 1 / 3, 0.1, 0.3, 1 / 128, 3 / 1024])
 def test_steps_at_times_that_are_rounded_otherwise_have_the_same_names(step, offset):
@@ -192,6 +193,7 @@ def test_steps_at_times_that_are_rounded_otherwise_have_the_same_names(step, off
         assert (np.diff(product_cells[1]) == 64).all()
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("step", "steps"), [(0.1, 1), (0.1, 10), (0.01, 1), (1e-3, 100), (1 / 3, 3)])
 def test_parts_have_the_steps_of_the_run_however_late_they_are(step, steps):
     """1024.9 - 1024.8 is more than 0.1 by rounding, which is no time for a step."""
@@ -328,7 +330,7 @@ def driven():
 TIMES = (-0.4, 0.1, 1.3, 2.0, 6.0)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", NOISELESS_CASES)
 def test_a_run_in_parts_is_the_run_to_rounding(name):
     """With equal steps; a part starts at its own time, from the last state and attitude of the one before."""
@@ -344,7 +346,7 @@ def test_a_run_in_parts_is_the_run_to_rounding(name):
     assert distance > 1e-2 if system.is_driven else distance < 1e-12  # the control: times are absolute
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["body, Gauss", "attitude, Runge-Kutta", "bath", "torque, Gauss"])
 def test_a_run_goes_on_from_a_file(name, tmp_path):
     """States, times and attitudes of a file are those of the run, so what goes on from them is, to the bit."""
@@ -364,6 +366,7 @@ def test_a_run_goes_on_from_a_file(name, tmp_path):
     assert np.abs(rests[1].x[-1] - whole_run.x[-1]).max() < 1e-13
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "name",
     [
@@ -393,7 +396,7 @@ def test_adaptive_steps_that_end_where_parts_do_are_those_of_parts():
         assert np.abs(part.x[-1] - whole_run.x[np.searchsorted(whole_run.t, TIMES[i])]).max() < 1e-6
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-10)], ids=["fixed", "adaptive"])
 @pytest.mark.parametrize("cut_time", [0.3, 1.5, 1.57, 1.5707, 1.6, 4.7, 5.0])
 def test_events_of_a_run_in_parts_are_those_of_the_run(step, cut_time):

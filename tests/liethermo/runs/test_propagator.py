@@ -64,7 +64,7 @@ def start_of(system, x0):
     return system.state(x0) if system.sites else x0
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", SYSTEMS)
 @pytest.mark.parametrize("method", METHODS.values(), ids=METHODS.keys())
 def test_final_state_equals_that_of_integrate(name, method):
@@ -80,7 +80,7 @@ def test_final_state_equals_that_of_integrate(name, method):
     assert solution.audit().passed
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("span", [(0.0, 1.0), (0.5, 0.6), (2.0, 2.0 + 3 * STEP), (-1.0, 0.1)])
 def test_spans_that_end_between_steps(span):
     body, method = rigid_body(), lt.MetriplecticGauss(2)
@@ -157,6 +157,7 @@ def test_a_result_is_not_overwritten_by_the_next_call():
     assert np.array_equal(one, copy)
 
 
+@pytest.mark.slow
 def test_steps_that_need_newton():
     body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=60.0)
     propagator = lt.Propagator(body, lt.MetriplecticGauss(1), 0.5)
@@ -217,6 +218,7 @@ def test_runs_of_one_problem_do_not_share_what_they_return():
     assert first.audit().passed
 
 
+@pytest.mark.slow
 def test_a_run_that_fell_back_is_told_each_time():
     """The array engine takes over in every run of such a system, and every run says so."""
     unsupported = lambda m: jnp.sum(jnp.array([1.0, 2.0, 3.0]) * m**2) / 2 + 0.0 * jnp.sum(jnp.fft.fft(m).real)  # noqa: E731

@@ -45,6 +45,7 @@ def test_an_otto_engine_has_its_efficiency():
     np.testing.assert_allclose(cycle.heat, omega * np.array([p_hot - p_cold, p_cold - p_hot]), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_refrigerator_has_its_coefficient_of_performance():
     """Work drives heat from the cold bath to the hot one where ``omega_low / T_cold < omega_high / T_hot``."""
     refrigerator, kinks = otto_engine(low=0.4, high=2.0, cold=1.0, hot=1.6)
@@ -75,6 +76,7 @@ def test_a_driven_atom_is_that_of_its_stroboscopic_map():
     np.testing.assert_allclose(np.abs(cycle.multipliers), np.abs(values[order[1:]]), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_mechanical_cycle():
     """A damped oscillator that is driven: amplitude ``f / |k - omega^2 + i c omega|``."""
     c, omega, period = 0.3, 1.4, 2 * np.pi / 1.4

@@ -62,6 +62,7 @@ def test_an_energy_that_is_known_in_the_span_only(method, step):
     assert run.audit().passed
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("step", [STEP, lt.Adaptive(1e-6)], ids=["fixed", "adaptive"])
 def test_on_the_array_engine(step):
     run = lt.integrate(forced_oscillator(), START, SPAN, step, lt.MetriplecticGauss(2), engine="array")
@@ -106,7 +107,7 @@ def test_a_flow_and_its_derivative():
     assert np.abs(jax.jacfwd(end)(jnp.asarray(START)) - np.column_stack(exact)).max() < 1e-5
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(8), lt.MetriplecticTaylor(8)], ids=str
 )
@@ -127,6 +128,7 @@ def test_a_torque_that_ends_as_a_root(method):
         assert np.abs(run.x[-1] - exact.y[:, -1]).max() < tolerance
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", [lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4)], ids=str)
 def test_a_torque_that_needs_the_attitude(method):
     def torque(t, mu, g):
@@ -136,6 +138,7 @@ def test_a_torque_that_needs_the_attitude(method):
     assert run.audit().passed
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("stages", [1, 2])
 def test_an_energy_whose_power_is_infinite_at_the_end(stages):
     """The derivative of a root by time is infinite where it ends; the motion and the work are finite."""

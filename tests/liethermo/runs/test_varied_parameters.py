@@ -39,6 +39,7 @@ def built_systems(monkeypatch):
     return built
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_values_of_another_symmetry_in_any_order(method):
     generic, isotropic, symmetric = [1.0, 0.5, 2.0], [1.0, 1.0, 1.0], [2.0, 2.0, 1.0]
@@ -67,6 +68,7 @@ def test_moments_of_inertia_after_those_of_a_sphere():
         assert np.array_equal(propagator.final(MU, SPAN, parameters={"energy.inertia": inertia}), expected)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_rates_of_zero_and_rates_that_nearly_are(method):
     propagator = lt.Propagator(body((1.0, 0.5, 2.0)), method, STEP)
@@ -94,6 +96,7 @@ def test_no_system_is_built_for_values_that_need_the_same_program(built_systems)
         assert np.array_equal(final, propagator(MU, SPAN, parameters={"dissipation.rate": rate}).x[-1])
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", METHODS[:2], ids=str)
 def test_baths_of_other_capacities_and_temperatures(method):
     x0, propagator = np.append(MU, 0.3), lt.Propagator(body_with_bath(), method, STEP)
@@ -153,6 +156,7 @@ def state_or_error(propagator, x0, parameters, is_run):
         return str(error)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", UNUSUAL_VALUES)
 @pytest.mark.parametrize("method", METHODS[:2], ids=str)
 def test_unusual_values_give_the_states_and_the_errors_of_runs(name, method):
@@ -176,6 +180,7 @@ def test_a_method_that_preserves_functions_and_a_copy_for_another_process():
             assert np.array_equal(p.final(list(MU), list(SPAN), parameters={"energy.A": A}), expected)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("method", METHODS[:2], ids=str)
 def test_final_states_are_those_of_runs(name, method):

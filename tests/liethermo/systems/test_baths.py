@@ -26,7 +26,7 @@ def motion(t, u):
     return [*(torque + RATE * np.cross(s, torque)), heat / (1.0 + 0.5 * np.sin(t)), u[3] * 0.5 * np.cos(t)]
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4)])
 def test_a_bath_with_a_given_temperature_does_its_work(method):
     reference = solve_ivp(motion, (0.0, 6.0), [*START, 0.0, 0.0], rtol=1e-11, atol=1e-12).y[:, -1]
@@ -64,6 +64,7 @@ def test_noise_follows_a_temperature_that_rises_slowly():
     assert abs(mean - (1.0 / np.tanh(cold) - 1.0 / cold)) > 20.0 * error
 
 
+@pytest.mark.slow
 def test_a_cryostat_cools_electrons_through_phonons():
     """Three baths: electrons of capacity ``c T``, phonons, and a cryostat whose temperature is a function of time."""
     baths = lt.HeatBaths(

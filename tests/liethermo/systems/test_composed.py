@@ -323,6 +323,7 @@ def test_conductances_are_parameters():
     assert np.allclose(jax.grad(production)(3.0), swept[0], rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_conductances_that_depend_on_temperatures_and_states():
     """Fourier's law with them by hand; both laws in every step; the order in which an edge names its bodies."""
     stone = lambda: lt.Subsystem(Warm(jnp.asarray(1.0)), 1)  # noqa: E731
@@ -384,7 +385,7 @@ def piston():
     return lt.ComposedSystem(bodies, gases, [(0, 2, 0.3), (2, 1, 0.2)], validate=False)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "order"),
     [
@@ -426,6 +427,7 @@ def test_variational_integrators_of_several_entropies(method, order):
     assert abs(friction) > 1e-5
 
 
+@pytest.mark.slow
 def test_means_over_maps_where_the_mass_depends_on_the_position():
     """Scheme 3 gives each map a momentum of its own: order 2 against a Gauss method, and the same step by SciPy."""
     metric = lambda q: jnp.array([1.0 + 0.5 * q[0] ** 2])  # noqa: E731

@@ -212,6 +212,7 @@ VARIATIONAL = [(V.verlet(), 1.0), (V.midpoint(), 2.0), (V.symmetrised(), 2.0), (
 GEODESIC = [(V.midpoint(retraction="exp"), 2.0), (V.symmetrised("exp"), 2.0), (V.verlet("exp"), 1.0)]
 
 
+@pytest.mark.slow
 def test_the_pendulum_by_gauss():
     check(pendulum(), lt.MetriplecticGauss(2), 4.0, keeps_energy=True)
 
@@ -372,6 +373,7 @@ def test_laws_and_order_of_herglotz_equations_on_the_sphere():
     check(herglotz_pendulum(), lt.MetriplecticGauss(2), 4.0, keeps_energy=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(4, marks=pytest.mark.slow)])
 def test_orders_of_discrete_herglotz_on_the_sphere(order):
     found = discrete_errors(order, (640, 1280) if order == 1 else (20, 40))

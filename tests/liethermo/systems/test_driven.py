@@ -140,6 +140,7 @@ def test_orders_and_laws_against_scipy(case, method, ends):
     assert (np.abs(slopes - method.order) < 0.25).all(), (errors, slopes)
 
 
+@pytest.mark.slow
 def test_the_law_over_ten_thousand_steps():
     run = lt.integrate(SHAKEN, [1.0, 0.2], (0.5, 100.5), 0.01, GAUSS[2], engine="compiled", save_every=100)
     audit = run.audit()
@@ -174,7 +175,7 @@ METHODS = [
 ]
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_an_energy_that_does_not_change_does_no_work(method):
     """Written as H(x, t) it gives the steps of H(x), whatever the slopes handed to the method."""
@@ -185,7 +186,7 @@ def test_an_energy_that_does_not_change_does_no_work(method):
     assert np.abs(timed[..., -1]).max() == 0.0
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_time_is_exact(method):
     """Whatever the slopes handed to the method, t' = 1, where the entropy law and the energy are corrected too."""
@@ -242,6 +243,7 @@ def test_adaptive_steps_do_not_see_the_clock():
     assert np.abs(runs[0].x[-1] - runs[1].x[-1]).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_a_sweep_of_the_amplitude():
     amplitudes = np.linspace(0.0, 1.0, 5)
     found_values = lt.ensemble(

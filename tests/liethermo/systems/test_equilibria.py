@@ -25,6 +25,7 @@ def body_frequency(axis: int, momentum: float) -> complex:
 # -- rigid bodies -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("axis", range(3))
 def test_frequencies_of_a_free_body_are_those_of_euler(axis):
     motion = lt.linearise(lt.models.free_rigid_body(MOMENTS), 0.8 * np.eye(3)[axis])
@@ -59,6 +60,7 @@ def test_all_equilibria_of_a_leaf_are_found():
     assert rest.stable == [True] * 4 + [False] * 2
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("unit", [1e-20, 1.0, 1e20])
 def test_the_unit_of_momentum_does_not_matter(unit):
     """Momenta, energies and rates in other units have the same equilibria, with the same stability."""
@@ -126,6 +128,7 @@ def test_a_direction_that_is_not_on_the_leaf_would_be_neutral():
 # -- every Lie algebra of three dimensions ----------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(("kind", "h"), BIANCHI)
 def test_every_bianchi_type(kind, h):
     """``H = (x - x*) A (x - x*) / 2`` is at rest at x*, with the eigenvalues of ``Pi(x*) A``."""

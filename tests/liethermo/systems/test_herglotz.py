@@ -188,6 +188,7 @@ def test_42():
     assert not solution.audit().passed
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("given", [OSCILLATOR, lambda q, v, S: OSCILLATOR(jnp.array([q[0], v[0], S]))], ids=["1", "3"])
 def test_the_action_of_the_midpoint_rule(given):
     made = lt.DiscreteHerglotz.midpoint(given).discrete_lagrangian
@@ -250,7 +251,7 @@ def solved_step(method, x, h):
     return np.asarray(x + method.increment(h, k))
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [pytest.param(4, marks=pytest.mark.slow), 2])
 @pytest.mark.parametrize("S0", [3.7, 0.0])
 def test_discrete_herglotz_of_higher_order(order, S0):

@@ -110,6 +110,7 @@ def test_rates_of_mass_action():
         assert lt.integrate(system, x, (0.0, 1.0), 0.05).audit().passed
 
 
+@pytest.mark.slow
 def test_particles_that_carry_entropy():
     """Between equal chemical potentials over T, what they carry alone decides; the energy is exact either way."""
     gas = lambda: lt.Subsystem(lambda x: GAS.internal_energy(x[0], jnp.append(x[1:], jnp.ones(2)), 1.0), 2, species=1)  # noqa: E731

@@ -283,6 +283,7 @@ def test_a_step_that_is_refused():
 # -- heat on a grid ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_exact_heat_grid():
     """Against the exponential of the matrix; 3 by 4 nodes."""
     T = np.random.default_rng(0).uniform(200.0, 400.0, (3, 4))

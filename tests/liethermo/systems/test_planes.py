@@ -97,8 +97,8 @@ def evaluate_functions(system, x, d, compensation, k):
     return jnp.stack([energy.value(x), energy.sensitivity(x)]), energy.rounding_scale(x), vectors
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", SYSTEMS)
-@pytest.mark.sampled(3)
 def test_functions_are_the_same(name):
     system = SYSTEMS[name]
     found_values, x = reorder_spins(system), state(system)
@@ -147,8 +147,8 @@ def ring(**changes):
     return lt.models.spin_lattice(N_LARGE, anisotropy_constant=0.1, rate=0.2, **changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [METHODS[0], *METHODS[3:], lt.MetriplecticTaylor(4)], ids=str)
-@pytest.mark.sampled(1)
 def test_a_run_of_a_large_system_is_in_that_order_and_no_user_sees_it(method, monkeypatch):
     system = ring()
     x0 = system.state(unit(N_LARGE))

@@ -45,6 +45,7 @@ def test_the_structure_is_that_of_the_dual_of_unitary_matrices():
     assert np.abs(g.ad_star(element, np.array(dual)) - np.array(moved)).max() <= 1e-14
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("n", [2, 3, 4])
 def test_at_a_constant_temperature_it_is_lindblads_equation(n):
     H = np.diag(np.cumsum(np.arange(n) * 0.7 + 0.3)).astype(complex)
@@ -101,6 +102,7 @@ SYSTEMS = {
 }
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_the_generator_is_the_force_at_the_gradients(name):
     """The form without the entropy, for Hamiltonians and couplings of no special form."""
@@ -195,7 +197,7 @@ SYSTEM_METHOD_PAIRS = [
 ]
 
 
-@pytest.mark.sampled("a finite bath-Taylor", "unital noise-explicit")
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("name", "by"), SYSTEM_METHOD_PAIRS)
 def test_every_dissipation_keeps_its_laws_by_every_method(name, by):
     """From random states; and from one next to a pure state, at which steps may be refused."""
@@ -282,7 +284,7 @@ def test_noise_without_a_bath():
     assert np.abs(motion(turning, RHO) - lindblad(RHO, QUBIT, [(X, 0.3)])).max() <= 1e-15
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(1), lt.MetriplecticGauss(2)], ids=str
 )
@@ -330,6 +332,7 @@ def test_a_hamiltonian_in_terms_is_the_function_that_they_make():
     assert np.abs(many.x[1] - alone.x[-1]).max() <= 1e-15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [lt.MetriplecticMidpoint(), pytest.param(lt.MetriplecticGauss(2), marks=pytest.mark.slow)], ids=str
 )
@@ -414,6 +417,7 @@ def meeting(size, gap):
 GAPS = [0.0, 1e-12, 1e-8, 1e-4, 0.3]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("size", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (3, 4, 8))])
 @pytest.mark.parametrize(
     "method",
@@ -463,6 +467,7 @@ def test_midpoint_steps_keep_trace_purity_and_energy_where_eigenvalues_meet():
     assert np.ptp(run.entropy) <= 4e-15
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("method", "steps"),
     [
@@ -490,6 +495,7 @@ def test_a_driven_isolated_system_keeps_its_spectrum(method, steps):
         assert np.ptp(np.linalg.eigvalsh(q.density(run.x)), axis=0).max() <= 3e-15
 
 
+@pytest.mark.slow
 def test_long_taylor_steps_obey_both_laws():
     q, t = qubit(), 100.0
     solution = lt.integrate(q, q.state(RHO), (0.0, t), 4.0, lt.MetriplecticTaylor(24))
@@ -501,6 +507,7 @@ def test_long_taylor_steps_obey_both_laws():
     assert abs((rho[0, 0] - rho[1, 1]).real - rest - ((RHO[0, 0] - RHO[1, 1]).real - rest) * np.exp(-fast * t)) <= 1e-13
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", [lt.MetriplecticRungeKutta(6), lt.MetriplecticGauss(2)], ids=str)
 def test_a_constant_that_is_added_to_the_energy_changes_nothing(method):
     runs = [
@@ -518,6 +525,7 @@ def test_couplings_and_products_keep_the_floor_of_the_entropy():
     assert (lt.QuantumSystem(QUBIT, entropy=floor) * lt.QuantumSystem(QUBIT)).entropy == floor
 
 
+@pytest.mark.slow
 def test_eigenvectors_of_larger_matrices_are_those_of_lapack():
     """In programs of the array engine too, where a loop of rotations takes much longer."""
     H, V = np.diag(np.arange(8.0)), np.diag(np.sqrt(np.arange(1.0, 8.0)), 1)  # of one frequency: a table of many terms

@@ -51,6 +51,7 @@ def test_a_maser_has_the_efficiency_of_its_frequencies(drive, hot):
     assert (power > 0.0) == (cold / hot < COLD_LEVEL / HOT_LEVEL)
 
 
+@pytest.mark.slow
 def test_a_strong_drive_equalises_the_levels_of_the_maser():
     """The flux of quanta at saturation, from the balance of the populations ``p1 = p2``."""
     hot, cold = 5.0, 0.6
@@ -111,7 +112,7 @@ def test_the_local_current_is_that_of_its_equations(g):
     np.testing.assert_allclose(local_current((1.0, 1.0), T, g), expected, rtol=1e-9)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("g", [0.1, 0.001])
 def test_the_global_current_is_that_of_two_modes(g):
     """Each mode of frequency ``1 +- g`` couples with half of its weight to either bath; no trace of g is left."""
@@ -143,6 +144,7 @@ def warm_and_cool(t):
     return 0.7 + 0.3 * jnp.sin(t)
 
 
+@pytest.mark.slow
 def test_a_qubit_follows_a_bath_that_is_warmed_and_cooled():
     """Populations by SciPy; the ledger has the work ``dT/dt y`` on the bath, and the entropy does not fall."""
     omega, rate = 1.3, 0.2
@@ -167,6 +169,7 @@ def test_a_qubit_follows_a_bath_that_is_warmed_and_cooled():
     np.testing.assert_allclose(qubit.heat_currents(run.x[-1], 6.0), [-current], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_classical_body_heats_a_bath_whose_temperature_is_driven():
     bath = lt.HeatBaths(np.inf, warm_and_cool)
     body = lt.LiePoissonSystem(

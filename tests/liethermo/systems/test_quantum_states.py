@@ -129,7 +129,7 @@ def test_a_bath_takes_the_heat_of_a_small_gap_between_large_energies():
     assert ends[1] == pytest.approx(ends[0], rel=1e-12)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("shift", [1e6, 1e10, 1e13])
 @pytest.mark.parametrize("kind", ["isolated", "noise", "bath", "driven", "terms", "steepest ascent"])
 def test_a_constant_added_to_the_hamiltonian_changes_no_state(kind, shift):
@@ -212,7 +212,7 @@ COLD = {
 }
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "by", ["explicit", "midpoint", *(pytest.param(name, marks=pytest.mark.slow) for name in ("Taylor", "Gauss"))]
 )
@@ -272,6 +272,7 @@ def test_the_entropy_and_its_gradient_are_finite_at_eigenvalues_that_are_zero_to
         assert not np.isfinite(lt.VonNeumann(floor).gradient(x)).all()
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("p", [1e-3, 1e-41, 0.0, -1e-14])
 @pytest.mark.parametrize("other", [0.5, 1e-20, -1e-18])
 def test_the_entropy_changes_by_its_discrete_gradient_at_zero_eigenvalues(p, other):
@@ -288,7 +289,7 @@ BATHS = {
 }
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("baths", BATHS)
 def test_pure_states_run_by_methods_without_the_gradient_of_the_entropy(baths):
     """With and without a floor of the entropy: the one that is asked for is the one that is seen."""
@@ -310,7 +311,7 @@ def test_pure_states_run_by_methods_without_the_gradient_of_the_entropy(baths):
             lt.integrate(q, [0.0, 1.0], (0.0, 2.0), 0.05, lt.MetriplecticMidpoint())
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "method",
     [
@@ -468,6 +469,7 @@ def test_what_is_refused(message):
         BAD[message](qubit())
 
 
+@pytest.mark.slow
 def test_an_ensemble_over_the_temperatures_of_a_function():
     """The couplings are split by the Hamiltonian, which is known where temperatures are not."""
 
@@ -480,6 +482,7 @@ def test_an_ensemble_over_the_temperatures_of_a_function():
     assert np.abs(many.x[1] - alone).max() <= 1e-15
 
 
+@pytest.mark.slow
 def test_a_study_over_quantum_systems():
     """A point is a system of its own, made by a function."""
 

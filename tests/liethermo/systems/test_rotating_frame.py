@@ -46,6 +46,7 @@ def test_the_phase_of_a_drive():
     np.testing.assert_allclose(H, mean, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_three_levels_with_two_frequencies():
     """A ladder: the drive of the lower transition is resonant, the upper one is left out."""
     D = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
@@ -55,6 +56,7 @@ def test_three_levels_with_two_frequencies():
     assert sorted(np.round(list(frame.components(D)), 12)) == [-3.0, -1.0, 1.0, 3.0]
 
 
+@pytest.mark.slow
 def test_the_error_of_the_approximation_is_linear_in_the_drive():
     """Terms that oscillate at ``2 omega`` with the strength ``Omega / 2`` move populations by ``Omega / (4 omega)``."""
     frame, errors = lt.RotatingFrame(UPPER_LEVEL), []

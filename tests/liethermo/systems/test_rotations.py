@@ -154,6 +154,7 @@ MODELS = {
 }
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", MODELS)
 def test_a_state_has_the_angular_velocity_and_temperature_it_was_given(name):
     system, omega = MODELS[name](), np.array([0.1, -0.2, 0.3])
@@ -238,6 +239,7 @@ def test_ensembles_and_files_have_angular_velocities(tmp_path):
         lt.bodies.angular_velocity(lt.integrate(lt.models.damped_oscillator(), [1.0, 0.0, 0.0], (0.0, 0.1), 0.1))
 
 
+@pytest.mark.slow
 def test_rotor_rates_of_a_driven_body_and_of_an_ensemble(tmp_path):
     """A motor of torque u turns a free wheel by ``p' = u``, with ``p = J (a . Omega + w)``."""
     J, u = 0.1, 0.02

@@ -252,7 +252,7 @@ def test_it_is_the_thermodynamic_herglotz_system_for_eta_L():
     assert np.abs(field(braking) - field(closed)).max() < 1e-12 * np.abs(field(closed)).max()
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "order"),
     [

@@ -147,6 +147,7 @@ test_refusals = refusal_test(
 )
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "dissipation",
     [

@@ -290,6 +290,7 @@ def single_spin_solution(t, start, field, rate):
     )
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", [lt.MetriplecticMidpoint(), lt.MetriplecticRungeKutta(6)], ids=str)
 def test_a_single_spin_switches_when_the_closed_form_says(method):
     B, rate = 2.0, 0.15
@@ -353,7 +354,7 @@ def run_damped_lattice(count, h, t, method, **given):
     return solution
 
 
-@pytest.mark.sampled("MetriplecticRungeKutta(order=4)")
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ORDER_METHODS, ids=str)
 def test_ten_thousand_damped_spins_with_a_bath(method):
     run_damped_lattice(10_000, 0.1, 2.0, method)
@@ -477,6 +478,7 @@ def test_what_noise_turns_a_step_solves_for_at_once():
     assert 2 * at_once.stats.fixed_point_iterations < control.stats.fixed_point_iterations
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("step", "needs_newton"), [(0.02, False), (0.06, True)])
 def test_precession_and_damping_of_each_spin_are_solved_for_at_once(step, needs_newton):
     """The control takes a fifth more iterations in short steps, and Newton's method in long ones."""
@@ -494,6 +496,7 @@ def test_precession_and_damping_of_each_spin_are_solved_for_at_once(step, needs_
         assert 1.2 * at_once.stats.fixed_point_iterations < control.stats.fixed_point_iterations
 
 
+@pytest.mark.slow
 def test_spins_with_torque_power_and_two_baths_move_as_the_iteration_alone_says():
     sites, runs = (3, 2), []
     for kind in (lt.SpinSystem, IteratedRotation):
@@ -530,6 +533,7 @@ def test_equations_of_each_spin_have_the_derivative_of_its_velocity():
 FIELDS = np.array([0.5, 2.0, 5.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damping", [lt.LandauLifshitz, pytest.param(Unsaid, marks=pytest.mark.slow)])
 def test_free_spins_in_a_bath_have_langevins_magnetisation(damping):
     """Within three standard errors, in steps of a fifth of the time that a spin forgets its direction in.

@@ -62,7 +62,7 @@ def row(run, law):
     return next(row for row in run.audit().rows if row.law == law)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("torque", "method"),
     covering(itertools.product(TORQUES, METHODS), lambda torque, method: [(torque, type(METHODS[method])), method]),
@@ -114,7 +114,7 @@ def test_a_turn_about_the_momentum_is_not_made_of_rounding():
     assert np.abs(run.attitude - other.attitude).max() < 2e-3  # 4e-4 seen, of steps of fourth order
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["midpoint", "gauss2", "rk4"])
 def test_a_torque_on_a_body_with_a_wheel(method):
     """On so(3) + R with the group of the first: the momentum in space is that of the first three components."""
@@ -219,6 +219,7 @@ def test_orders_against_scipy(method, kind, exact):
     assert (np.abs(slopes - method.order) < (0.5 if method.explicit else 0.2)).all(), (errors, slopes)
 
 
+@pytest.mark.slow
 def test_explicit_and_implicit_methods_agree(exact):
     """Taylor series go through the exponential of the angles too."""
     run = lt.integrate(rubbing(from_all_sides, warm=False), START, (0.4, 2.4), 0.1, METHODS["rk8"], engine="compiled")
@@ -229,6 +230,7 @@ def test_explicit_and_implicit_methods_agree(exact):
 # -- closed forms ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["gauss2", "rk4"])
 def test_a_body_is_spun_up_from_rest(name):
     """``Omega = tau t / I`` and ``W = (tau t)^2 / (2 I)`` about a principal axis, a constant torque in the body."""
@@ -242,6 +244,7 @@ def test_a_body_is_spun_up_from_rest(name):
     assert run.audit().passed
 
 
+@pytest.mark.slow
 def test_libration_under_gravity_gradient():
     """A satellite that points to the earth swings in pitch at ``sqrt(3 n^2 (I_roll - I_yaw) / I_pitch)``."""
     roll, pitch, yaw = 9.0, 10.0, 4.0
@@ -310,7 +313,7 @@ INTERNAL = {
 }
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("torque", "name", "step"),
     covering(
@@ -376,6 +379,7 @@ def test_what_a_torque_acts_on_does_not_depend_on_its_numbers():
     assert with_a_wheel(INTERNAL["motor"]).torque_laws.changed_casimirs == {"mu4"}
 
 
+@pytest.mark.slow
 def test_an_ensemble_over_the_moment_of_a_motor_is_single_runs():
     moments, method = np.array([[0.0], [0.1], [-0.2]]), METHODS["rk4"]
     system = with_a_wheel(lt.torques.Motor([0.3]), group=SO3)
@@ -424,6 +428,7 @@ def test_an_energy_that_depends_on_time_has_an_attitude():
 # -- ensembles, flows, files -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_an_ensemble_over_a_parameter_is_single_runs():
     """To the last bit, with equal steps and with adaptive ones; work and impulse too."""
     rates, method = np.linspace(0.3, 0.8, 3), METHODS["gauss2"]
@@ -519,6 +524,7 @@ def test_what_is_refused(build, words):
     assert "\n" not in str(refused.value).strip().split(": Traceback")[0]
 
 
+@pytest.mark.slow
 def test_a_study_of_a_torque(tmp_path):
     """Every point is a run of its own, to the last bit, where the torque depends on time and attitude."""
 

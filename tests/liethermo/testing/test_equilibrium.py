@@ -211,7 +211,7 @@ TESTED_DISSIPATIONS = {
 }
 
 
-@pytest.mark.sampled("MetriplecticRungeKutta(order=4)")
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [pytest.param(m, id=str(m)) for m in lt.registered_methods(special=True)])
 def test_methods(method):
     assert testing.check_method(method).passed

@@ -79,6 +79,7 @@ def top_with_preserved_casimir():
 # -- all of them hold -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("make", "x0", "method", "step", "time", "relations"),
     [
@@ -124,6 +125,7 @@ def assert_relation_holds(run):
     assert report.passed
 
 
+@pytest.mark.slow
 @settings(max_examples=4)
 @given(runs(FAST_METHODS, [name for name in testing.RELATIONS if name not in SLOW_RELATIONS]))
 def test_relations_hold(run):

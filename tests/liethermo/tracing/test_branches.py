@@ -181,6 +181,7 @@ def entangled_branches(x, specs):
     return values[3:]
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(steps, st.integers(0, 99))
 def test_lanes_of_random_branches_equal_single_runs(specs, seed):

@@ -281,6 +281,7 @@ print(run.x.tobytes().hex()[-4000:])
 """
 
 
+@pytest.mark.slow
 def test_a_second_process_computes_the_same_bits(tmp_path):
     environment = {**os.environ, "LIETHERMO_CACHE": str(tmp_path / "cache"), "JAX_COMPILATION_CACHE_DIR": ""}
     outputs, files = [], []

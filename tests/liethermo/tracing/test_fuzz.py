@@ -35,6 +35,7 @@ def check_random_function(seed: int, **options) -> fuzz.Outcome:
     return outcome
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("seed", range(5))
 def test_random_functions(seed):
     check_random_function(seed, count=3)

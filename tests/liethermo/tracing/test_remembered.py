@@ -95,6 +95,7 @@ def test_a_method_with_arrays_of_its_own_can_be_compiled():
     assert np.abs(a.x - b.x).max() < 1e-14
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [lt.MetriplecticRungeKutta(4), pytest.param(lt.MetriplecticGauss(2), marks=pytest.mark.slow)], ids=str
 )

@@ -232,20 +232,21 @@ def slopes(system, method):
     )
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("case", DISSIPATIONS, ids=lambda case: case.name)
 def test_every_dissipation(case):
     f, args = slopes(build(mf.so(3), case), MetriplecticMidpoint())
     check_agrees_with_jax(f, *args)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", list(registered_methods()), ids=str)
 def test_every_method(method):
     f, args = slopes(build(mf.so(3), DISSIPATIONS[0]), method)
     check_agrees_with_jax(f, *args)
 
 
+@pytest.mark.slow
 def test_compiled_su3_with_killing_dissipation():
     g = mf.su(3)
     system = lt.LiePoissonSystem(g, lt.Quadratic(np.linspace(1, 2, 8)), g.casimirs(2)[0], lt.KillingDissipation(0.1))

@@ -408,6 +408,7 @@ def test_batches_equal_loops(group):
     assert group.belongs(g[0, 0]).shape == ()
 
 
+@pytest.mark.sampled(2)
 @each_program
 def test_compiled_programs_make_no_lapack_calls(group):
     """Two LAPACK calls in one program can wait for each other forever (see manifolds.matrices.linear.solve)."""

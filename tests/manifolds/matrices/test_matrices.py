@@ -29,6 +29,7 @@ def hermitian(n, seed=0, is_complex=True):
     return (a + a.conj().T) / 2
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("points", [(2.0, 2.0), (2.0, 2.0 + 1e-9), (2.0, 2.05, 2.0), (2.0, 7.0, 2.0), (1e-9, 3.0, 0.5)])
 @pytest.mark.parametrize("name", NAMES)
 def test_divided_differences(name, points):
@@ -72,6 +73,7 @@ def test_divided_differences_of_a_function_of_ones_own():
         assert float(f.divided_difference(jnp.asarray(x), jnp.asarray(y))) == pytest.approx(expected_value, rel=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_complex", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_derivatives_of_every_order_where_eigenvalues_meet(is_complex):
     """Both modes agree, and each derivative is the difference quotient of the next lower one."""

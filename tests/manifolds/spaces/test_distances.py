@@ -66,6 +66,7 @@ def test_a_distance_of_zero_is_zero():
         assert float(space.distance(x, x)) == 0.0 == float(space.squared_distance(x, x))
 
 
+@pytest.mark.slow
 def test_derivatives_of_every_order_at_equal_points():
     """Along a geodesic from c the square is t^2: its derivatives are 0, 2, 0, 0, 0 at t = 0."""
     space = mf.Sphere(2)

@@ -186,7 +186,7 @@ def test_no_point_nearby_is_better(space):
         assert mf.dispersion(space, points, weights, neighbour) > min_dispersion + 1e-4
 
 
-@pytest.mark.sampled("S^2")
+@pytest.mark.slow
 @pytest.mark.parametrize("space", SPACES, ids=lambda s: s.name)
 def test_means_and_dispersions_can_be_traced(space):
     """Results under jit and vmap equal those without; derivatives agree with differences along geodesics."""

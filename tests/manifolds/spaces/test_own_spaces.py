@@ -201,6 +201,7 @@ def test_the_suite_of_spaces():
     mf.testing.check_space(mf.LevelSet(square, (2, 2), metric=np.diag([1.0, 2.0, 3.0, 4.0])))
 
 
+@pytest.mark.slow
 def test_a_run_on_a_torus():
     """The equations are no polynomials: the implicit method projects its steps onto them and keeps its laws."""
     space = mf.LevelSet(torus, 3, name="torus")

@@ -16,7 +16,7 @@ def params_by_name(objects):
     return [pytest.param(thing, id=thing.name) for thing in objects]
 
 
-@pytest.mark.sampled(18)
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("g", params_by_name(ALGEBRAS))
 def test_algebras(g):
     assert testing.check_algebra(g, degree=2).passed

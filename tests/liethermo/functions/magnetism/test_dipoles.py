@@ -30,6 +30,7 @@ def direct_energy(positions, moments, spins):
     return total
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("name", "cells"), [("chain", 7), ("kagome", (3, 2)), ("sc", (3, 2, 4)), ("bcc", (2, 3, 2))])
 def test_open_lattices_are_direct_sums(name, cells):
     crystal = mag.lattice(name, cells, constant=1.3, periodic=False)
@@ -67,6 +68,7 @@ def test_a_square_lattice_has_the_sum_of_zeta_and_beta():
     np.testing.assert_allclose(T, np.array([-0.5, 0, 0, -0.5, 0, 1.0]) * total, atol=1e-14)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["sc", "bcc", "fcc"])
 def test_cubic_lattices_have_the_field_of_lorentz(name):
     """The sum over a sphere vanishes; without a depolarising field ``-4 pi M / 3`` remains."""
@@ -156,6 +158,7 @@ def test_chains_of_several_atoms_are_direct_sums():
         np.testing.assert_allclose(tensor, expected, atol=2e-11)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("name", "periodic"),
     [("kagome", True), ("kagome", (False, True)), ("pyrochlore", (True, False, True)), ("diamond", True)],
@@ -167,6 +170,7 @@ def test_the_splitting_does_not_matter(name, periodic):
     np.testing.assert_allclose(first, second, atol=2e-15 * np.abs(first).max() * 10)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("periodic", [(True, True), (False, True), (False, False)])
 def test_periodic_energies_are_sums_over_images(periodic):
     """The gradient is that of the energy, and an enlarged lattice of copies has a multiple of the energy."""

@@ -147,6 +147,7 @@ def test_skyrmions_have_integer_charges():
     assert abs(half - round(half)) > 0.01
 
 
+@pytest.mark.slow
 def test_spins_in_equilibrium_have_the_temperature_of_their_distribution():
     """Independent spins with a quartic anisotropy, sampled from exp(-E / T)."""
     T, K, B, count = 0.4, 0.5, 0.7, 400

@@ -120,6 +120,7 @@ def test_a_wall_has_its_width_and_its_energy():
     assert energy == pytest.approx(4.0 * math.sqrt(A * K), rel=2e-3)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("kind", "sense"), [("bulk", "Bloch"), ("interfacial", "Neel")])
 def test_a_spiral_has_its_pitch_and_its_hand(kind, sense):
     """The pitch is ``4 pi A / |D|`` [Dzyaloshinskii 1965]: 128 cells of it in a periodic row are the ground state."""
@@ -141,6 +142,7 @@ def test_a_spiral_has_its_pitch_and_its_hand(kind, sense):
     assert min(spirals, key=spirals.get) == (1 if kind == "bulk" else -1)
 
 
+@pytest.mark.slow
 def test_a_film_resonates_at_the_frequency_of_kittel():
     """``f = gamma / 2 pi sqrt((B + (N_y - N_x) mu_0 M) (B + (N_z - N_x) mu_0 M))`` [Kittel 1948], one prism in SI."""
     edges, M, B, u = (100e-9, 80e-9, 10e-9), 8e5, 0.1, mag.units("SI")
@@ -181,6 +183,7 @@ def test_standard_problem_4():
     assert (np.diff(run.energy) < 0.0).all()
 
 
+@pytest.mark.slow
 def test_a_micromagnet_keeps_both_laws():
     baths = lt.HeatBaths(64.0, 4e-21)  # of capacity 64 k, at 300 K
     film = lt.models.micromagnet((8, 4, 2), alpha=0.1, baths=baths)

@@ -8,6 +8,7 @@ import liethermo as lt
 mag = lt.magnetism
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("degrees", [1.0, 20.0, 45.0, 80.0])
 def test_a_grain_switches_at_the_field_of_stoner_and_wohlfarth(degrees):
     """``h = (cos^{2/3} a + sin^{2/3} a)^{-3/2}`` in units of 2 K / mu [Stoner & Wohlfarth 1948]."""

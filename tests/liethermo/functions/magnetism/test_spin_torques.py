@@ -30,6 +30,7 @@ def test_a_spin_in_a_current_has_its_closed_form_and_its_work(method):
     np.testing.assert_allclose(phase, (B - b) * run.t, atol=3e-3)
 
 
+@pytest.mark.slow
 def test_a_wall_moves_with_the_electrons_if_alpha_is_beta():
     """Gilbert's equation with beta = alpha carries a rigid texture with the velocity u [Barnes & Maekawa 2005]."""
     count, alpha, u = 120, 0.2, 0.8

@@ -44,6 +44,7 @@ PAIR_TERMS = {
 }
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", PAIR_TERMS)
 def test_bond_terms_are_sums_over_bonds(name):
     build, of_pair = PAIR_TERMS[name]
@@ -142,6 +143,7 @@ def test_fields_that_depend_on_site_and_time():
     assert (np.diff(run.entropy) > -1e-13).all()
 
 
+@pytest.mark.slow
 def test_a_resonant_field_turns_a_spin_by_the_formula_of_rabi():
     """In the frame that rotates with a circular field the motion is a rotation about (b, 0, B - w)."""
     B, b, w = 1.0, 0.2, 0.9
@@ -195,6 +197,7 @@ CASES = [
 ]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("name", "engine"), CASES)
 def test_every_term_keeps_both_laws(name, engine):
     crystal = mag.lattice("honeycomb", (2, 2), periodic=False)

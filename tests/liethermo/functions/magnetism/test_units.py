@@ -55,6 +55,7 @@ def test_gilbert_and_landau_lifshitz_are_their_equations(alpha):
     np.testing.assert_allclose(g, -gamma * np.cross(s, B) + alpha * np.cross(s, g), rtol=1e-13, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_a_bath_in_kelvin_gives_the_function_of_langevin():
     """``<s_z> = coth x - 1 / x`` with x = mu B / k T [Langevin 1905], by noise in meV, ps, tesla and kelvin."""
     u, B, T, count = mag.units("meV"), 200.0, 100.0, 512

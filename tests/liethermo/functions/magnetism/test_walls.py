@@ -74,6 +74,7 @@ def test_a_wall_below_walkers_field_moves_at_its_velocity(share, edge, rtol):
     assert velocity == pytest.approx(mobility() * wall_width(angle) * share * WALKER_FIELD, rel=rtol)
 
 
+@pytest.mark.slow
 def test_a_wall_above_walkers_field_turns_and_is_slower():
     """The mean velocity is ``gamma width (B - sqrt(B^2 - B_W^2) / (1 + alpha^2)) / alpha`` for a small hard axis.
 
