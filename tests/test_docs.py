@@ -24,7 +24,6 @@ PAGES = [
         page for page in (ROOT / "docs").rglob("*.md") if not set(BUILT_FOLDERS) & set(page.relative_to(ROOT).parts)
     ),
 ]
-EXAMPLES = sorted((ROOT / "examples").rglob("plot_*.py"))
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -41,25 +40,12 @@ def scratch(tmp_path, monkeypatch):
     plt.close("all")
 
 
-SLOW_PAGES = (
-    *("on_manifolds", "own_space", "friction_heat_work", "own_algebra", "heat_friction", "learn"),
-    *("studies", "own_method", "coming_from", "choose_method", "own_loop", "exact_laws", "errors"),
-    *("asteroid_wobble", "real_bodies", "qubit_and_bath", "events", "derivatives", "ensembles", "audits"),
-    *("geometer", "relaxation", "magnets", "fluids", "quantum", "learning", "learn_own_data", "method_author"),
-    *("install", "spacecraft", "torques"),
-)
-"""Pages that compile many programs: they run in the slow tier."""
+PAGES_WITH_PYTHON = [page for page in PAGES if BLOCK.search(page.read_text())]
 
 
-def _pages():
-    for page in PAGES:
-        if BLOCK.search(page.read_text()):
-            yield pytest.param(page, id=_name(page), marks=pytest.mark.slow if page.stem in SLOW_PAGES else ())
-
-
-@pytest.mark.sampled(3)
+@pytest.mark.sampled("docs/howto/choose_dissipation.md", "docs/reference/conventions.md")
 @pytest.mark.filterwarnings("ignore::manifolds.NoPolynomialCasimirWarning")  # a page shows it
-@pytest.mark.parametrize("page", list(_pages()))
+@pytest.mark.parametrize("page", PAGES_WITH_PYTHON, ids=_name)
 def test_the_python_blocks_of_a_page_run_in_order(page, scratch):
     text, namespace = page.read_text(), {"__name__": "__main__"}
     for block in BLOCK.finditer(text):
@@ -67,20 +53,10 @@ def test_the_python_blocks_of_a_page_run_in_order(page, scratch):
         exec(compile("\n" * above + block[1], str(page), "exec"), namespace)
 
 
-FAST_EXAMPLES = ("plot_relaxed_rigid_body", "plot_own_lie_algebra", "plot_damped_oscillator", "plot_discrete_herglotz")
-"""Examples that compile few programs; the others are in the slow tier."""
-
-
-def _examples():
-    for path in EXAMPLES:
-        yield pytest.param(path, id=_name(path), marks=() if path.stem in FAST_EXAMPLES else pytest.mark.slow)
-
-
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("example", list(_examples()))
-def test_an_example_runs_and_draws(example, scratch):
-    runpy.run_path(str(example), run_name="__main__")
-    assert plt.get_fignums(), "a gallery example shows at least one figure"
+def test_an_example_runs_and_draws(scratch):
+    """One example of the gallery runs as a script; `make docs` runs all of them."""
+    runpy.run_path(str(ROOT / "examples/heat/plot_damped_oscillator.py"), run_name="__main__")
+    assert plt.get_fignums(), "an example shows at least one figure"
 
 
 @pytest.mark.parametrize("package", [liethermo, manifolds], ids=lambda package: package.__name__)

@@ -18,10 +18,9 @@ from liethermo.engines.compiled.machine_code import MachineCode
 from liethermo.tracing.builder import BOOLEAN_OPERATIONS, COMPARISONS, OPERATIONS, Instruction
 from liethermo.tracing.program import Program
 from liethermo.tracing.scalarize import UnsupportedPrimitive, scalarize
-from tests.liethermo.tracing.test_scalarize import CASES, program_of
 from tests.machine_code import compile_program as compiled
 from tests.machine_code import count_memory_maps as memory_maps
-from tests.scalar_programs import check_outputs as check
+from tests.scalar_programs import program_of
 
 BINARY_OPERATIONS = {*"add sub mul div pow rem max min atan2 igamma igammac".split(), *COMPARISONS - {"is_finite"}}
 """Operations on two numbers."""
@@ -84,14 +83,6 @@ def test_comparisons_of_truth_values_and_of_integers(lanes):
     for a, b in finite_pairs[: len(finite_pairs) // lanes * lanes].reshape(-1, lanes, 2).swapaxes(1, 2):
         (result,), (expected,) = function(a, b), program.evaluate(a, b, batch=True)
         np.testing.assert_array_equal(result.reshape(expected.shape), expected)
-
-
-@pytest.mark.sampled(6)
-@pytest.mark.parametrize("name", CASES)
-def test_every_primitive(name):
-    f, *args = CASES[name]
-    program = program_of(f, *args)
-    check(program, args, program.evaluate(*args), compiled(program)(*args))
 
 
 def test_products_in_sums_are_the_same_in_every_lane():

@@ -55,9 +55,10 @@ def test_random_functions_from_a_new_seed():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", OPERATIONS)
-def test_every_operation_by_itself(name):
-    for seed in range(4):
+@pytest.mark.parametrize(("name", "derivative_seed"), [(name, 1 + i % 3) for i, name in enumerate(OPERATIONS)])
+def test_every_operation_by_itself(name, derivative_seed):
+    """The value of each operation, and one of its derivatives."""
+    for seed in (0, derivative_seed):
         summary = list(fuzz.SUMMARIES)[seed]
         function = fuzz.random_function(seed, [name], steps=1)
         outcome = fuzz.compare_with_jax(function, summary, seed)
