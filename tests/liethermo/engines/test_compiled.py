@@ -273,7 +273,7 @@ fourth_power.defjvp(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("adaptive", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("adaptive", [False, True])
 def test_newtons_method_that_cannot_be_compiled(adaptive):
     """The array engine takes over when a step first needs Newton's method, which contains an unsupported primitive."""
     stiff = lt.LiePoissonSystem(mf.so(3), fourth_power, lt.Quadratic(np.ones(3)), lt.KillingDissipation(2.0))

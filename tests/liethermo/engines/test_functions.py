@@ -129,7 +129,7 @@ def test_a_lane_is_a_single_run(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["solve", pytest.param("long scan", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["solve", "long scan"])
 def test_newton_has_them_too(name):
     """Newton's method is compiled with these functions, in steps that fixed-point iteration does not solve."""
     system = body(FUNCTIONS[name])

@@ -91,7 +91,7 @@ def test_an_entropy_with_a_constant():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", [pytest.param("array", marks=pytest.mark.slow), "compiled"])
+@pytest.mark.parametrize("engine", ["array", "compiled"])
 def test_engines_and_adaptive_steps(engine):
     runs = [
         lt.ensemble(

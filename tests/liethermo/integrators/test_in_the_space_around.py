@@ -261,7 +261,7 @@ def spd_matrices():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("space", "theirs"),
-    [(mf.Sphere(2), hypersphere), pytest.param(mf.SPD(2), spd_matrices, marks=pytest.mark.slow)],
+    [(mf.Sphere(2), hypersphere), (mf.SPD(2), spd_matrices)],
     ids=["sphere", "SPD"],
 )
 def test_gradient_flows_run_along_the_geodesics_of_geomstats(space, theirs):

@@ -220,8 +220,8 @@ def test_a_geomstats_space_gives_the_same_trajectory(method):
     ("name", "method"),
     [
         pytest.param("spin", MIDPOINT, id="S^2-midpoint"),
-        pytest.param("spin", GAUSS, id="S^2-gauss2", marks=pytest.mark.slow),
-        pytest.param("frame", MIDPOINT, id="SO(3)-midpoint", marks=pytest.mark.slow),
+        pytest.param("spin", GAUSS, id="S^2-gauss2"),
+        pytest.param("frame", MIDPOINT, id="SO(3)-midpoint"),
     ],
 )
 def test_both_engines_take_the_same_steps(build, name, method):

@@ -72,9 +72,9 @@ def spatial_momenta(solution):
     ("kind", "method"),
     [
         pytest.param("cayley", lt.MetriplecticMidpoint(), id="cayley-midpoint"),
-        pytest.param("exp", lt.MetriplecticGauss(2), id="exp-gauss2", marks=pytest.mark.slow),
+        pytest.param("exp", lt.MetriplecticGauss(2), id="exp-gauss2"),
         *(
-            pytest.param(kind, method, id=f"{kind}-{name}", marks=pytest.mark.slow)
+            pytest.param(kind, method, id=f"{kind}-{name}")
             for kind, method, name in [
                 ("exp", lt.MetriplecticMidpoint(), "midpoint"),
                 ("cayley", lt.MetriplecticGauss(2), "gauss2"),
@@ -299,7 +299,7 @@ def test_explicit_methods_conserve_spatial_momentum_to_their_order(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["SL(2)", *(pytest.param(n, marks=pytest.mark.slow) for n in ("SU(2)", "SE(3)"))])
+@pytest.mark.parametrize("name", ["SL(2)", *(n for n in ("SU(2)", "SE(3)"))])
 def test_cayley_on_the_matrices_does_not_conserve_spatial_momentum(name):
     """The former default: "g mu" is the coadjoint action of SO(3) and SE(2) alone."""
     assert momentum_drift(name, "cayley", lt.MetriplecticMidpoint(), 50) > 1e4 * RELATIVE_MOMENTUM_DRIFT

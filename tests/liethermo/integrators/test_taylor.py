@@ -205,7 +205,7 @@ def test_without_a_tolerance_the_order_is_that_of_1e_10():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("number", [1, 2])
 def test_spins_that_heat_baths(number):
     """The run agrees with the Runge-Kutta method of order 8 and obeys both laws."""
     rate = np.array([0.1, 0.5, 0.2])

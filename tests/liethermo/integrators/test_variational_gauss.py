@@ -19,7 +19,7 @@ def _slopes(errors):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("stages", "order"), [(2, 4), pytest.param(3, 6, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("stages", "order"), [(2, 4), (3, 6)])
 def test_orders_against_the_exact_solution(stages, order):
     """The order is 2s for states and energy; the entropy grows at every step, also in coarse ones."""
     method, system = lt.VariationalGauss(stages), lt.models.mass_spring_gas(**HOT)

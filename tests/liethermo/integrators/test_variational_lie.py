@@ -89,9 +89,7 @@ def _errors(system, x0, steps, t=2.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("make", "x0"), [(coupled_system, [0.5, 1.0, -0.4, 0.1]), pytest.param(body, X0, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("make", "x0"), [(coupled_system, [0.5, 1.0, -0.4, 0.1]), (body, X0)])
 def test_observed_order(make, x0):
     """The order is 2, since the discrete Lagrangian is symmetric."""
     errors = _errors(make(), x0, (20, 40, 80, 160))

@@ -200,7 +200,7 @@ def test_trajectories_of_any_lengths_and_attitudes():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [2, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("number", [2, 8])
 def test_fits_to_few_trajectories_spread_as_their_errors(number):
     """Three trajectories were drawn again and again, and the deviation was 0.0."""
     data, options = records(0), {"matching": 50, "shooting": 20, "validation": 0}

@@ -107,7 +107,7 @@ def test_complex_groups_and_files(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", [pytest.param("array", marks=pytest.mark.slow), "compiled"])
+@pytest.mark.parametrize("engine", ["array", "compiled"])
 def test_ensembles_carry_attitudes(engine):
     """Each member equals a single run; one momentum may have several attitudes, and summaries have none."""
     system = lt.LiePoissonSystem(

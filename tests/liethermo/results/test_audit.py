@@ -81,9 +81,9 @@ def test_laws_of_what_starts_at_zero(case, tmp_path):
     "entropy",
     [
         pytest.param(lambda m: jnp.log(m @ m), id="log"),
-        pytest.param(lambda m: m @ m - 1.0, id="difference", marks=pytest.mark.slow),
-        pytest.param(lambda m: jnp.tanh(m @ m), id="tanh", marks=pytest.mark.slow),
-        pytest.param(lambda m: 0.5 * m @ m + 1e12, id="constant", marks=pytest.mark.slow),
+        pytest.param(lambda m: m @ m - 1.0, id="difference"),
+        pytest.param(lambda m: jnp.tanh(m @ m), id="tanh"),
+        pytest.param(lambda m: 0.5 * m @ m + 1e12, id="constant"),
     ],
 )
 def test_entropies_fall_by_the_rounding_of_what_they_are_computed_from(entropy):

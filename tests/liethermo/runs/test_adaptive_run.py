@@ -65,9 +65,7 @@ def test_the_error_follows_the_tolerance(stages, rtol, exact):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("stages", "h"), [(s, h) if s == 2 else pytest.param(s, h, marks=pytest.mark.slow) for s, h in SIZES.items()]
-)
+@pytest.mark.parametrize(("stages", "h"), list(SIZES.items()))
 def test_the_estimate_of_the_local_error(stages, h):
     """Along a trajectory it is right to a factor of two in the mean, nowhere far above, and hardly anywhere far below.
 
@@ -280,7 +278,7 @@ def test_a_body_on_its_middle_axis_falls_when_it_has_to(p, rtol, stages, max_err
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["pendulum", pytest.param("double well", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["pendulum", "double well"])
 def test_other_unstable_rests(name):
     """The top of a pendulum and of a double well; linear and cubic forces against each other."""
     energy, force = {

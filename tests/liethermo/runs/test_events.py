@@ -54,7 +54,7 @@ def test_control_without_looks_a_later_one_is_taken_for_the_first(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [METHODS[1], pytest.param(METHODS[2], marks=pytest.mark.slow)], ids=str)
+@pytest.mark.parametrize("method", [METHODS[1], METHODS[2]], ids=str)
 def test_a_body_that_relaxes_for_a_moment_is_relaxed(method):
     """The entropy production falls below the limit, rises again within a step or two, and falls for good later."""
     x0s = np.random.default_rng(0).standard_normal((200, 3))

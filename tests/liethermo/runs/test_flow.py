@@ -148,7 +148,7 @@ def test_a_system_that_closes_over_tracers(entropy):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("entropy", [pytest.param(True, marks=pytest.mark.slow), False], ids=["relaxing", "free"])
+@pytest.mark.parametrize("entropy", [True, False], ids=["relaxing", "free"])
 def test_derivatives_by_parameters_in_a_closure(entropy):
     """Outside of jit, backwards; against differences of the flow."""
 
@@ -195,13 +195,8 @@ MODELS = {
 }
 
 
-HEAVY = ("body_with_wheels", "gas_piston", "cylinder", "mass_spring_gas")
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) if name in HEAVY else name for name in MODELS]
-)
+@pytest.mark.parametrize("name", MODELS)
 def test_models_of_traced_numbers(name):
     """Every parameter may be a tracer, and the field is the one with the number in its place."""
     p = 1.2
@@ -315,8 +310,8 @@ def test_a_flow_with_a_loop_of_unknown_length():
     "method",
     [
         lt.MetriplecticGauss(1),
-        pytest.param(lt.MetriplecticGauss(2), marks=pytest.mark.slow),
-        pytest.param(lt.MetriplecticMidpoint(), marks=pytest.mark.slow),
+        lt.MetriplecticGauss(2),
+        lt.MetriplecticMidpoint(),
     ],
     ids=str,
 )

@@ -151,7 +151,7 @@ def test_the_energy_of_a_motion_that_goes_on(engine):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("gradient", ["gonzalez", pytest.param("mean_value", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("gradient", ["gonzalez", "mean_value"])
 def test_the_energy_in_long_steps(gradient):
     """The difference of H, used at every step, must not take back the correction of the drift (which was 1e-13)."""
     system, method = general_body(6.6e-6), lt.MetriplecticMidpoint(gradient)

@@ -11,7 +11,6 @@ import manifolds as mf
 from liethermo.engines.stage_solver import slope_rounding_scale
 from liethermo.functions.rounding import value_and_rounding_scale
 from liethermo.models.thermo_particles import thermo_particles_solution
-from tests.cases import slow_case
 
 two = functools.cache(lt.models.thermo_particles)
 WARM = np.log([0.5, 1.5])  # relaxes to T = 1, where both entropies vanish
@@ -63,7 +62,7 @@ def test_a_grid_that_cools_to_temperature_one(engine):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["array", pytest.param("compiled", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("engine", ["array", "compiled"])
 def test_an_ensemble_that_comes_to_rest(engine):
     starts = np.random.default_rng(0).uniform(0.5, 1.5, (5, 2))
     starts = np.log(starts / starts.mean(axis=1, keepdims=True))
@@ -118,7 +117,7 @@ def test_an_adaptive_run_takes_no_more_than_it_may(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "method",
-    [lt.MetriplecticGauss(2), slow_case(lt.MetriplecticMidpoint()), slow_case(lt.MetriplecticMidpoint("mean_value"))],
+    [lt.MetriplecticGauss(2), lt.MetriplecticMidpoint(), lt.MetriplecticMidpoint("mean_value")],
 )
 def test_terms_that_cancel_in_the_energy(method):
     """``1 - cos q`` is rounding near q = 0, of the size of 1, however small the energy is that comes out."""

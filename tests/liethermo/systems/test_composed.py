@@ -238,7 +238,7 @@ class MidpointTemperatures(HeatConduction):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("conduction", "energy", "entropy"),
-    [pytest.param(ConstantFactor, True, False, marks=pytest.mark.slow), (MidpointTemperatures, False, True)],
+    [(ConstantFactor, True, False), (MidpointTemperatures, False, True)],
 )
 def test_conduction_that_keeps_one_law_alone(conduction, energy, entropy):
     """Skewness without Fourier's factor keeps the energy only, its sign without skewness the entropy only."""

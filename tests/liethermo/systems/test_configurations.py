@@ -374,7 +374,7 @@ def test_laws_and_order_of_herglotz_equations_on_the_sphere():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("order", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("order", [1, 2, 4])
 def test_orders_of_discrete_herglotz_on_the_sphere(order):
     found = discrete_errors(order, (640, 1280) if order == 1 else (20, 40))
     assert abs(np.log2(found[0] / found[1]) - order) < 0.2, found

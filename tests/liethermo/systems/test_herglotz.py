@@ -252,7 +252,7 @@ def solved_step(method, x, h):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("order", [pytest.param(4, marks=pytest.mark.slow), 2])
+@pytest.mark.parametrize("order", [4, 2])
 @pytest.mark.parametrize("S0", [3.7, 0.0])
 def test_discrete_herglotz_of_higher_order(order, S0):
     """SML 6.3 asks for more than order 1: the order for any first action; symmetric in time."""

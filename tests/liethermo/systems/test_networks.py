@@ -151,9 +151,7 @@ def warm_of_one(y):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "method", [lt.MetriplecticMidpoint(), pytest.param(lt.MetriplecticGauss(2), marks=pytest.mark.slow)], ids=str
-)
+@pytest.mark.parametrize("method", [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2)], ids=str)
 def test_the_compressed_jacobian_is_the_jacobian(method):
     """With a hub that is found by pulling back; and every entry of the pattern is one that can occur."""
     n, h = 12, 0.1
@@ -318,7 +316,7 @@ def test_heat_grid():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["array", pytest.param("compiled", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("engine", ["array", "compiled"])
 def test_stiff_steps_of_a_few_bodies(engine):
     """Whole Newton steps leave the domain of these; halved ones do not."""
     grid, x0 = lt.models.heat_grid((3, 3)), np.random.default_rng(0).uniform(-0.5, 0.5, 9)

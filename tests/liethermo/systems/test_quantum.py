@@ -333,9 +333,7 @@ def test_a_hamiltonian_in_terms_is_the_function_that_they_make():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "method", [lt.MetriplecticMidpoint(), pytest.param(lt.MetriplecticGauss(2), marks=pytest.mark.slow)], ids=str
-)
+@pytest.mark.parametrize("method", [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2)], ids=str)
 def test_newtons_method_takes_the_derivative_of_the_generator(method):
     """The slopes differ from it by the order of the method; the control: the identity alone is far off."""
     q = lt.QuantumSystem(QUBIT, lt.ThermalJumps([(LOWER, RATE)]), baths=lt.HeatBaths(capacity=0.8, temperature=T))

@@ -213,11 +213,9 @@ COLD = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "by", ["explicit", "midpoint", *(pytest.param(name, marks=pytest.mark.slow) for name in ("Taylor", "Gauss"))]
-)
-@pytest.mark.parametrize("temperature", [0.1, pytest.param(1 / 30, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("turned", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("by", ["explicit", "midpoint", "Taylor", "Gauss"])
+@pytest.mark.parametrize("temperature", [0.1, 1 / 30])
+@pytest.mark.parametrize("turned", [False, True])
 def test_a_ladder_relaxes_to_a_cold_state(by, temperature, turned):
     """Populations of Gibbs' state fall to exp(-70) and exp(-210): to eigenvalues that are zero to rounding."""
     (method, step, within), size = COLD[by], 8

@@ -11,7 +11,7 @@ import manifolds as mf
 from liethermo.systems.invariants import conserves, preserved_names
 from liethermo.testing.suites import rebuild_pytree
 from liethermo.tracing.interpret import evaluate_at_points
-from tests.cases import DISSIPATIONS, build, slow_case
+from tests.cases import DISSIPATIONS, build
 from tests.liethermo.closed_systems import ISOLATED_SYSTEMS
 from tests.liethermo.integrators.test_convergence import SYSTEMS
 
@@ -48,7 +48,7 @@ def test_fields_and_laws(make):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["sum of frictions", slow_case("spin with a bath"), slow_case("warm top")])
+@pytest.mark.parametrize("name", ["sum of frictions", "spin with a bath", "warm top"])
 def test_trajectories(name):
     system = SYSTEMS[name]()
     x0 = system.samples(1, scale=0.5)[0]

@@ -534,7 +534,7 @@ FIELDS = np.array([0.5, 2.0, 5.0])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("damping", [lt.LandauLifshitz, pytest.param(Unsaid, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("damping", [lt.LandauLifshitz, Unsaid])
 def test_free_spins_in_a_bath_have_langevins_magnetisation(damping):
     """Within three standard errors, in steps of a fifth of the time that a spin forgets its direction in.
 

@@ -96,9 +96,7 @@ def test_a_method_with_arrays_of_its_own_can_be_compiled():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "method", [lt.MetriplecticRungeKutta(4), pytest.param(lt.MetriplecticGauss(2), marks=pytest.mark.slow)], ids=str
-)
+@pytest.mark.parametrize("method", [lt.MetriplecticRungeKutta(4), lt.MetriplecticGauss(2)], ids=str)
 def test_one_program_serves_all_calls(method, monkeypatch):
     """The span, the outputs and the tolerance are arguments of the program, whether Python or NumPy numbers."""
     traces, trace = Counter(), programs._ArrayFunction.__call__

@@ -74,7 +74,7 @@ def test_divided_differences_of_a_function_of_ones_own():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("is_complex", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize("is_complex", [False, True])
 def test_derivatives_of_every_order_where_eigenvalues_meet(is_complex):
     """Both modes agree, and each derivative is the difference quotient of the next lower one."""
     A = np.diag([2.0, 2.0])
