@@ -6,6 +6,7 @@ An algebra or a method takes part as soon as the library registers it, a dissipa
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -285,6 +286,22 @@ def covering(cases, keys: Callable) -> list:
                 chosen_indices.add(i)
                 found_keys |= own_keys
     return [cases[i] for i in sorted(chosen_indices)]
+
+
+def few_combinations(**values):
+    """Return a mark that gives a test few combinations of its arguments.
+
+    Of three arguments each pair of values meets in some case; of two, each value has a case.
+    """
+    import pytest
+
+    cases = list(itertools.product(*(range(len(of_argument)) for of_argument in values.values())))
+    chosen = covering(cases, lambda *case: itertools.combinations(enumerate(case), len(case) - 1))
+    combinations_of_values = [
+        tuple(list(of_argument)[i] for of_argument, i in zip(values.values(), case, strict=True)) for case in chosen
+    ]
+    name_of = lambda value: getattr(value, "__name__", None) or str(value)  # noqa: E731
+    return pytest.mark.parametrize(tuple(values), combinations_of_values, ids=name_of)
 
 
 def rows(audit, law):

@@ -6,6 +6,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
+from tests.cases import few_combinations
 
 EPS = np.finfo(float).eps
 QUARTIC_ENERGY = lambda x: 0.5 * x @ x + 0.1 * x[0] ** 4  # noqa: E731
@@ -44,9 +45,7 @@ def test_a_state_that_relaxes(constant):
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize("method", [*EXPLICIT, *IMPLICIT], ids=str)
-@pytest.mark.parametrize("constant", [1e3, 1e4, 1e8])
-@pytest.mark.parametrize("build", [damped_system, oscillator_system])
+@few_combinations(build=[damped_system, oscillator_system], constant=[1e3, 1e4, 1e8], method=[*EXPLICIT, *IMPLICIT])
 def test_a_constant_does_not_change_the_motion(build, constant, method):
     change, run = energy_difference(build, constant, method, 1000, 0.1)
     assert run.audit().passed

@@ -10,6 +10,7 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.engines import adaptive_steps
 from liethermo.engines.root_bracket import first_event_values_at_step_ends
+from tests.cases import few_combinations
 from tests.systems import oscillator, rigid_body
 
 METHODS = [lt.MetriplecticGauss(3), lt.MetriplecticRungeKutta(8), lt.MetriplecticTaylor(20)]
@@ -114,10 +115,8 @@ JUMPS = {
 }
 
 
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("name", JUMPS)
-@pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-8)])
+@pytest.mark.sampled("a pole-compiled-0.1")
+@few_combinations(name=JUMPS, engine=["compiled", "array"], step=[0.1, lt.Adaptive(1e-8)])
 def test_a_jump_is_no_event_and_the_run_goes_on(name, engine, step):
     solution = run_until(JUMPS[name], step, engine)
     assert (solution.status.code, solution.event_time, solution.t[-1]) == ("completed", None, 3.0)
@@ -139,9 +138,7 @@ ZEROS = {
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("name", ZEROS)
-@pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-8)])
+@few_combinations(name=ZEROS, engine=["compiled", "array"], step=[0.1, lt.Adaptive(1e-8)])
 def test_a_zero_is_an_event_however_it_is_rounded(name, engine, step):
     until, exact = ZEROS[name]
     solution = run_until(until, step, engine, noise_size=3e-10 if name == "among large terms" else 1e-13)  # that of 1e6

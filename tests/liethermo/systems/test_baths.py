@@ -42,6 +42,7 @@ def test_a_bath_with_a_given_temperature_does_its_work(method):
     assert np.abs(system.temperatures(run.x, run.t)[:, 0] - 1.0 - 0.5 * np.sin(run.t)).max() < 1e-15
 
 
+@pytest.mark.slow
 def test_a_temperature_that_is_constant_as_a_function_changes_nothing():
     noise, ends = lt.Fluctuations(seed=1), []
     for temperature in (0.8, lambda t: 0.8 + 0.0 * t):
@@ -92,6 +93,7 @@ def test_the_pulse_has_its_energy_and_its_width():
     assert abs(float(pulse(0.55)) - 0.5 * float(pulse(0.5))) < 1e-12
 
 
+@pytest.mark.slow
 def test_a_temperature_below_zero_stops_the_run():
     system = spin_in_a_bath(lambda t: 1.0 - t)
     with pytest.raises(lt.IntegrationError):

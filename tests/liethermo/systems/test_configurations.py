@@ -217,6 +217,7 @@ def test_the_pendulum_by_gauss():
     check(pendulum(), lt.MetriplecticGauss(2), 4.0, keeps_energy=True)
 
 
+@pytest.mark.slow
 def test_the_pendulum_by_a_variational_scheme():
     check(pendulum(), V.midpoint(), 2.0)
 
@@ -380,6 +381,7 @@ def test_orders_of_discrete_herglotz_on_the_sphere(order):
     assert abs(np.log2(found[0] / found[1]) - order) < 0.2, found
 
 
+@pytest.mark.slow
 def test_units():
     """In units of mass 1e20 times smaller the motion is the same: the equations of the space are not drowned."""
     case, unit = pendulum(), 1e20

@@ -116,6 +116,7 @@ def test_other_functions_keep_names_of_their_own():
 # -- what the Gauss methods hold --------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("stages", [1, 2])
 def test_a_linear_function_that_the_dissipation_preserves_is_kept_to_rounding(stages):
     """Two spins with all of their momentum about one axis kept, by the motion and by the friction."""

@@ -61,6 +61,7 @@ def test_a_porous_piston_against_its_equations_written_out(method, order):
     assert np.ptp(piston().numbers_of_particles(runs[0].x).sum(axis=1)) < 1e-14
 
 
+@pytest.mark.slow
 def test_a_porous_piston_rests_at_equal_densities():
     """Temperatures, pressures and chemical potentials agree; both laws hold on the way."""
     run = lt.integrate(piston(), start(), (0.0, 200.0), 0.1)
@@ -91,6 +92,7 @@ def test_the_law_of_mass_action():
     assert abs(end[3] - 0.1) > 0.1
 
 
+@pytest.mark.slow
 def test_rates_of_mass_action():
     """``L = (k_f n_A n_B - k_b n_C) T / A`` gives the rates themselves, and is positive on either side of rest."""
 

@@ -17,7 +17,7 @@ from liethermo.functions.on_spaces import to_component_order, to_site_order
 from liethermo.integrators.base import pullback_method
 from liethermo.integrators.tableaus import gauss_tableau, kronrod_rule
 from liethermo.systems.spins import reorder_spins
-from tests.cases import BuiltOnUse
+from tests.cases import BuiltOnUse, few_combinations
 
 from .test_spins import ENERGIES, SITES, unit
 
@@ -115,9 +115,8 @@ def shapes(n):
     return (0.1, (n,)), (1e-17, (n,)), (1.0, (2, n))
 
 
-@pytest.mark.parametrize("method", METHODS, ids=str)
-@pytest.mark.parametrize("name", ["all together", "a function", "baths", "one bath"])
 @pytest.mark.slow
+@few_combinations(name=["all together", "a function", "baths", "one bath"], method=METHODS)
 def test_steps_are_the_same(name, method):
     system, h = SYSTEMS[name], jnp.asarray(0.02)
     method = method.on(system)
@@ -163,6 +162,7 @@ def test_a_run_of_a_large_system_is_in_that_order_and_no_user_sees_it(method, mo
     jax.clear_caches()
 
 
+@pytest.mark.slow
 def test_levels_keep_their_places():
     """Levels of an explicit method are no components of a state."""
     system, method = ring(), lt.MetriplecticRungeKutta(4)
@@ -201,6 +201,7 @@ def test_noise_is_that_of_sites_whatever_the_order(monkeypatch):
     jax.clear_caches()
 
 
+@pytest.mark.slow
 def test_a_scheme_that_takes_coordinates_in_their_order_keeps_it():
     system, method = SYSTEMS["one bath"], lt.MetriplecticMidpoint("coordinate_increment")
     first = initial_run_state_program(system, method, state(system))

@@ -13,6 +13,7 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.functions.gradients import EPS
 from liethermo.systems.transport import generator_field
+from tests.cases import covering, few_combinations
 from tests.liethermo.systems.qubits import (
     FULL,
     LOWER,
@@ -33,6 +34,7 @@ from tests.liethermo.systems.qubits import (
 )
 
 
+@pytest.mark.slow
 def test_the_structure_is_that_of_the_dual_of_unitary_matrices():
     structure, g = mf.DensityMatrices(3), mf.u(3)
     rho, H = random_density(3), random_density(3, 1)
@@ -198,7 +200,10 @@ SYSTEM_METHOD_PAIRS = [
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize(("name", "by"), SYSTEM_METHOD_PAIRS)
+@pytest.mark.parametrize(
+    ("name", "by"),
+    covering(SYSTEM_METHOD_PAIRS, lambda name, by: [(name, STEPS[by].explicit), by]),
+)
 def test_every_dissipation_keeps_its_laws_by_every_method(name, by):
     """From random states; and from one next to a pure state, at which steps may be refused."""
     q = QUANTUM_SYSTEMS[name]()
@@ -261,6 +266,7 @@ def test_steepest_ascent_beside_a_program_of_its_own():
     assert solution.audit().passed
 
 
+@pytest.mark.slow
 def test_steepest_ascent_keeps_the_rank():
     """By the midpoint scheme, which adds nothing to the motion, to rounding; by others to their order."""
     H = np.diag([0.0, 1.0, 2.5, 3.1]).astype(complex)
@@ -416,16 +422,9 @@ GAPS = [0.0, 1e-12, 1e-8, 1e-4, 0.3]
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize("size", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (3, 4, 8))])
-@pytest.mark.parametrize(
-    "method",
-    [
-        lt.MetriplecticGauss(2),
-        *(pytest.param(lt.MetriplecticGauss(s), marks=pytest.mark.slow) for s in (1, 3)),
-        lt.MetriplecticTaylor(8),
-        *(pytest.param(lt.MetriplecticRungeKutta(p), marks=pytest.mark.slow) for p in (4, 8)),
-    ],
-    ids=str,
+@few_combinations(
+    size=[2, 3, 4, 8],
+    method=[*map(lt.MetriplecticGauss, (2, 1, 3)), lt.MetriplecticTaylor(8), *map(lt.MetriplecticRungeKutta, (4, 8))],
 )
 def test_an_isolated_system_keeps_its_spectrum_where_eigenvalues_meet(method, size):
     """There the gradients of trace, purity and entropy depend on each other, and the entropy touches its level.

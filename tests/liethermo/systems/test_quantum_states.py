@@ -9,6 +9,7 @@ import scipy.linalg
 import liethermo as lt
 import manifolds as mf
 from liethermo.functions.gradients import EPS
+from tests.cases import few_combinations
 from tests.liethermo.systems.qubits import (
     LOWER,
     QUBIT,
@@ -213,9 +214,7 @@ COLD = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("by", ["explicit", "midpoint", "Taylor", "Gauss"])
-@pytest.mark.parametrize("temperature", [0.1, 1 / 30])
-@pytest.mark.parametrize("turned", [False, True])
+@few_combinations(by=["explicit", "midpoint", "Taylor", "Gauss"], temperature=[0.1, 1 / 30], turned=[False, True])
 def test_a_ladder_relaxes_to_a_cold_state(by, temperature, turned):
     """Populations of Gibbs' state fall to exp(-70) and exp(-210): to eigenvalues that are zero to rounding."""
     (method, step, within), size = COLD[by], 8
