@@ -10,7 +10,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.models.gases import gas_piston_state
-from tests.cases import DISSIPATIONS, build, energy_of
+from tests.cases import DISSIPATIONS, build, energy_of, few_combinations
 from tests.liethermo import random_systems
 from tests.refusals import refusal_test
 
@@ -134,11 +134,9 @@ POTENTIALS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", POTENTIALS)
-@pytest.mark.parametrize(
-    "method",
-    [lt.MetriplecticMidpoint(), lt.MetriplecticGauss(1), lt.MetriplecticGauss(3), lt.MetriplecticRungeKutta(4)],
-    ids=str,
+@few_combinations(
+    method=[lt.MetriplecticMidpoint(), lt.MetriplecticGauss(1), lt.MetriplecticGauss(3), lt.MetriplecticRungeKutta(4)],
+    kind=POTENTIALS,
 )
 def test_laws_of_a_thousand_random_systems(method, kind):
     """The laws hold for random energies and entropies; the midpoint scheme claims no entropy law for these."""

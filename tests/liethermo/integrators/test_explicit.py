@@ -39,14 +39,12 @@ def assert_laws(ensemble):
     ).all()
 
 
-@pytest.mark.sampled("MetriplecticRungeKutta(order=4)")
-@each_method
-def test_laws_of_random_systems(method):
-    assert_laws(random_run(mf.so(3), 24, 500, method))
+def test_laws_of_random_systems():
+    assert_laws(random_run(mf.so(3), 24, 500, RK(4)))
 
 
-MAX_DIM_OF_ORDER_20 = 6
-"""Maximum dimension of an algebra for a Taylor method of order 20: larger programs take LLVM half an hour."""
+MAX_DIM_OF_ORDER_20 = 3
+"""Maximum dimension of an algebra for a Taylor method of order 20: LLVM takes minutes for larger programs."""
 
 
 @pytest.mark.slow
@@ -69,22 +67,12 @@ def test_laws_of_a_thousand_systems(g, method):
 
 @pytest.mark.slow
 @each_method
-def test_drift_over_a_hundred_thousand_steps(method):
-    assert_no_drift(method, 100_000)
-
-
-@pytest.mark.slow
-@each_method
 def test_drift_over_a_million_steps(method):
-    assert_no_drift(method, 1_000_000)
-
-
-def assert_no_drift(method, steps):
-    """Assert that the energy and a conserved Casimir do not drift, for energies that are not quadratic."""
+    """The energy and a conserved Casimir do not drift, for energies that are not quadratic."""
     quartic = lambda m: 0.5 * jnp.sum(m**2 / jnp.array([5.0, 4.0, 2.0])) + 0.1 * m[0] ** 4 + jnp.cos(m[2])  # noqa: E731
     for friction in (None, lt.KillingDissipation(1e-4)):
         system = lt.LiePoissonSystem(mf.so(3), quartic, lt.Quadratic(np.ones(3)), friction)
-        run = lt.integrate(system, X0, (0.0, 0.1 * steps), 0.1, method, save_every=steps // 100)
+        run = lt.integrate(system, X0, (0.0, 100_000.0), 0.1, method, save_every=10_000)
         assert run.audit().energy_drift <= 2e-14
         assert run.stats.least_entropy_increment >= -4 * EPS * np.abs(run.entropy).max()
         if friction is None:

@@ -11,7 +11,7 @@ import scipy.sparse
 
 import liethermo as lt
 import manifolds as mf
-from tests.cases import BuiltOnUse
+from tests.cases import BuiltOnUse, few_combinations
 
 SITES = (3, 4)
 COUNT = 12
@@ -355,14 +355,7 @@ def run_damped_lattice(count, h, t, method, **given):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ORDER_METHODS, ids=str)
-def test_ten_thousand_damped_spins_with_a_bath(method):
-    run_damped_lattice(10_000, 0.1, 2.0, method)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", [*ORDER_METHODS, lt.MetriplecticGauss(2)], ids=str)
-@pytest.mark.parametrize("h", [0.1, 0.03, 0.01, 0.003, 0.001])
+@few_combinations(h=[0.1, 0.03, 0.01, 0.003, 0.001], method=[*ORDER_METHODS, lt.MetriplecticGauss(2)])
 def test_ten_thousand_damped_spins_with_a_bath_at_every_step(method, h):
     run_damped_lattice(10_000, h, 2.0, method)
 
