@@ -165,7 +165,6 @@ def test_a_rod_comes_to_its_flat_spin_in_the_relaxation_time(inertia):
     assert np.tan(angle[-1]) / np.tan(angle[0]) == pytest.approx(np.e, rel=1e-8)
 
 
-@pytest.mark.sampled(4)
 @pytest.mark.parametrize("middle", [162.75 * (1 - 1e-12), 162.7499, 162.7, 162.0, 155.0, 100.0, 37.5], ids=str)
 @pytest.mark.parametrize("tau", [1.0, 50.0, 5000.0])
 def test_the_relaxation_time_is_an_eigenvalue_of_the_linear_equations(middle, tau):

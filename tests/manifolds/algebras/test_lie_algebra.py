@@ -25,7 +25,6 @@ def is_close(a, b, scale=1.0):
 # -- beside the property suite, which tests/manifolds/testing runs on every algebra -----------------------------------
 
 
-@pytest.mark.sampled(14)
 @each_algebra
 def test_forms_and_matrices(g):
     """The trilinear form is ``kappa(x, [y, z])``, totally skew (BFM Remark 3.3); every registered algebra has
@@ -130,7 +129,6 @@ def upper_triangular_algebra(n):
     return mf.LieAlgebra.from_matrices(units, name=f"upper triangular {n}")
 
 
-@pytest.mark.sampled(10)
 @pytest.mark.parametrize("g", [*ALGEBRAS, upper_triangular_algebra(5)], ids=algebra_id)
 def test_structure_does_not_depend_on_the_basis(g):
     """Random bases are scaled by one factor, and each element by its own."""

@@ -72,7 +72,7 @@ def check_type(g, family):
     assert len(g.derivations()) == len(types[0].algebra().derivations())
 
 
-@pytest.mark.sampled(10)
+@pytest.mark.sampled(21)
 @pytest.mark.parametrize("name", CATALOGUE)
 def test_every_member_of_a_family_is_recognised_in_any_basis(name):
     for g in itertools.islice(members(name), 2):
@@ -376,7 +376,6 @@ def test_dimensions_are_those_of_the_literature(g):
     assert dimensions(g) == DIMENSIONS[g]
 
 
-@pytest.mark.sampled(5)
 @pytest.mark.parametrize("g", [g for g in DIMENSIONS if g.dim < 8], ids=lambda g: g.name)
 @pytest.mark.parametrize("exact", [True, False])
 def test_dimensions_do_not_depend_on_the_basis(g, exact):

@@ -29,7 +29,7 @@ def hermitian(n, seed=0, is_complex=True):
     return (a + a.conj().T) / 2
 
 
-@pytest.mark.sampled(5)
+@pytest.mark.sampled(10)
 @pytest.mark.parametrize("points", [(2.0, 2.0), (2.0, 2.0 + 1e-9), (2.0, 2.05, 2.0), (2.0, 7.0, 2.0), (1e-9, 3.0, 0.5)])
 @pytest.mark.parametrize("name", NAMES)
 def test_divided_differences(name, points):

@@ -170,7 +170,6 @@ def test_the_splitting_does_not_matter(name, periodic):
     np.testing.assert_allclose(first, second, atol=2e-15 * np.abs(first).max() * 10)
 
 
-@pytest.mark.sampled(1)
 @pytest.mark.parametrize("periodic", [(True, True), (False, True), (False, False)])
 def test_periodic_energies_are_sums_over_images(periodic):
     """The gradient is that of the energy, and an enlarged lattice of copies has a multiple of the energy."""

@@ -49,7 +49,6 @@ def pairs_by_distance(crystal, distance):
     return sorted(tuple(sorted(pair)) for pair in pairs)[::2]  # each bond is found from both ends
 
 
-@pytest.mark.sampled(11)
 @pytest.mark.parametrize("name", SHELLS)
 @pytest.mark.parametrize("borders", ["periodic", "open", "mixed"])
 def test_bonds_are_the_pairs_at_their_distance(name, borders):

@@ -44,7 +44,6 @@ PAIR_TERMS = {
 }
 
 
-@pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", PAIR_TERMS)
 def test_bond_terms_are_sums_over_bonds(name):
     build, of_pair = PAIR_TERMS[name]
