@@ -27,7 +27,7 @@ def test_every_line_is_on_the_page():
     assert len(ROWS) >= 39
 
 
-@pytest.mark.sampled(6)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", ROWS)
 def test_the_figures(name):
     figure = ROWS[name].figure()

@@ -255,6 +255,7 @@ def oscillator_and_logistic(omega, k):
     )
 
 
+@pytest.mark.slow
 def test_args():
     omega, k, t_final, z_final = 2.0, 4.0, 5.0, 0.99
     z0 = np.exp(-k * t_final) / ((1 - z_final) / z_final + np.exp(-k * t_final))

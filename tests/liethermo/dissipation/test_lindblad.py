@@ -69,6 +69,7 @@ def test_the_motion_is_that_of_the_exponential_of_its_superoperator():
     assert abs(np.trace(system.density(run.x[-1])) - 1.0) < 1e-14
 
 
+@pytest.mark.slow
 def test_a_drive_in_qutips_form_is_that_of_dop853():
     """``[H0, [H1, f]]`` with a function, and with an array of its values."""
     omega, Omega, gamma = 2.0, 0.5, 0.2

@@ -256,6 +256,7 @@ def test_functions_preserved_on_request():
     assert drifts[1] <= 2e-15
 
 
+@pytest.mark.slow
 def test_a_driven_body():
     """The energy changes by exactly the work done."""
     system = lt.LiePoissonSystem(

@@ -294,6 +294,7 @@ def test_two_ways_to_start(name):
     assert np.abs(method.state(system, X0[:2], solution.x[1, :2], X0[4], h, S1=S1) - X0).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_inconsistent_first_steps():
     method, system = SCHEMES["scheme 2"], ISOLATED_SYSTEMS["mechanical"]
     with pytest.raises(lt.InputError, match=r"not on the discrete constraint: \|P_d\| = .* Leave S1 out"):

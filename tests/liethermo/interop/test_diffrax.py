@@ -46,7 +46,7 @@ def test_adaptive_steps_and_diffrax_own_solvers_agree():
     assert int(ours.stats["num_accepted_steps"]) > 3
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("method", list(lt.registered_methods()), ids=str)
 def test_time_runs_backwards(method):
     """Backward runs have the order of the method, against SciPy; energy is constant and the entropy falls."""

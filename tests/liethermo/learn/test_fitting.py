@@ -266,6 +266,7 @@ def test_a_body_is_found_from_its_attitudes_alone():
     assert float(fitted_system.dissipation.part.rate) * inertia[2] == pytest.approx(0.08, rel=0.1)
 
 
+@pytest.mark.slow
 def test_components_and_a_function_of_the_state_are_one_mechanism():
     t, x = cases.record(2, 21)
     system = cases.oscillator(energy=lt.learn.Energy(_Bath(jnp.zeros(()))))

@@ -178,6 +178,7 @@ def records_with_missing_positions():
     return positions
 
 
+@pytest.mark.slow
 def test_missing_values_have_no_effect():
     fitted_system = fit_spring([(TIMES, x) for x in records_with_missing_positions()], substeps=2)
     np.testing.assert_allclose(fitted_system.training.values, [2.0, 0.3], rtol=1e-4)

@@ -171,6 +171,7 @@ def test_two_masses_on_a_slider_swing_with_the_reduced_mass():
     np.testing.assert_allclose(run.joints["mass"], 0.3 * np.cos(np.sqrt(2.0 / 0.8) * run.t), atol=1e-11)
 
 
+@pytest.mark.slow
 def test_cat_turns_over_without_angular_momentum():
     """Two halves on a universal joint bend round in a circle: at zero momentum the base has turned at the end."""
     tree = lt.bodies.Tree()
@@ -200,6 +201,7 @@ def test_motor_inside_changes_no_momentum_and_its_work_is_in_the_balance():
     assert run.audit().passed
 
 
+@pytest.mark.slow
 def test_first_pulse_of_a_motor_at_rest_passes_the_audit():
     """The state is zero when the motor starts, so its size there is no scale of the residual of a step."""
     pulse = lt.PiecewiseConstant([0.7, 1.5], [0.2])

@@ -142,6 +142,7 @@ def test_dual_spin_against_velocities():
     assert np.ptp(np.linalg.norm(run.x[:, :3], axis=1)) < 4e-15
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("rate_name", "final_nutation"), [("platform_rate", 0.0), ("rotor_rate", 0.5 * np.pi)])
 def test_where_the_friction_is_decides_whether_a_slender_dual_spin_body_is_stable(rate_name, final_nutation):
     """A damping platform keeps a rod's spin if it is despun [Likins 1967]; a damping rotor leaves it for the flat

@@ -241,6 +241,7 @@ def test_every_model_takes_torques_that_act_on_the_momentum_of_the_whole(model):
     assert solution.audit().passed
 
 
+@pytest.mark.slow
 def test_a_body_with_wheels_takes_torques_that_need_no_attitude():
     system = lt.models.body_with_wheels(torque=[T.ConstantInBody([0.1, 0.0, 0.0]), T.Motor([0.0, 0.0, 0.05])])
     x = system.state(angular_velocity=[0.1, 0.2, 0.3], rotor_rates=[0.0, 0.1, 0.2])

@@ -147,6 +147,7 @@ def test_it_ends_in_a_spin_about_the_axis_of_greatest_inertia_as_warm_as_the_bal
     assert float(body.temperatures(run.x[-1])[0]) == pytest.approx(1.5 + temperature_rise, rel=1e-10)
 
 
+@pytest.mark.slow
 def test_body_quantities_of_an_ensemble_are_those_of_its_members():
     """The members have different rates, or different inertias and then no common axis."""
     body = lt.models.tumbling_body(ROUND, rate=0.05)

@@ -173,6 +173,7 @@ def test_momentum_sphere_is_labelled_by_the_names_of_the_basis(relaxed_solution)
     assert "Lx**2 + Ly**2 + Lz**2" in system.casimirs()
 
 
+@pytest.mark.slow
 def test_momentum_sphere_of_a_loaded_solution(body, relaxed_solution, tmp_path):
     loaded_solution = lt.load(relaxed_solution.save(tmp_path / "body.nc"))
     assert labels(lt.plot.momentum_sphere(loaded_solution)) == labels(lt.plot.momentum_sphere(relaxed_solution, body))
@@ -309,6 +310,7 @@ def test_other_dimensions_and_flat_axes_are_refused(body, relaxed_solution):
         lt.plot.momentum_sphere(relaxed_solution, body, ax=flat_axes)
 
 
+@pytest.mark.slow
 def test_momentum_sphere_of_a_body_with_a_bath():
     """The body is shown alone: its momentum stays on its sphere, and its energy falls while the total is constant."""
     system = lt.LiePoissonSystem(

@@ -179,6 +179,7 @@ def test_a_preserved_function_that_is_a_casimir_of_one_member():
 # -- domains and inertia ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_member_outside_its_own_domain_is_not_started():
     """The temperature ``2 a S`` at the same state is negative for one member, neither the first nor an extreme one."""
 

@@ -316,6 +316,7 @@ def test_a_system_is_prepared_once():
         assert not any(isinstance(leaf, np.ndarray) for leaf in jax.tree_util.tree_leaves(q))
 
 
+@pytest.mark.slow
 def test_a_hamiltonian_in_terms_is_the_function_that_they_make():
     """Constant terms, pairs in tuples and in lists; and amplitudes of an ensemble, which a function hides."""
     H0, H1, H2 = (random_hermitian(3, seed) for seed in (1, 2, 3))
@@ -464,7 +465,7 @@ def test_midpoint_steps_keep_trace_purity_and_energy_where_eigenvalues_meet():
     assert np.ptp(run.entropy) <= 4e-15
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "steps"),
     [
@@ -561,7 +562,7 @@ EVENT_CASES = {
 }
 
 
-@pytest.mark.sampled("midpoint")
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EVENT_CASES)
 def test_a_run_stops_where_a_population_or_the_purity_has_a_value(name):
     """Beside the closed form of the population, which falls to 0.3, and the purity of the last state."""

@@ -124,6 +124,7 @@ def test_the_global_current_is_that_of_two_modes(g):
     np.testing.assert_allclose(system.heat_currents(system.steady_state().x)[0], expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_local_heat_may_flow_from_cold_to_hot():
     """Local heat does where ``omega_h / T_h > omega_c / T_c`` [Levy & Kosloff 2014]; global heat never does."""
     T = (1.0, 0.8)
@@ -180,6 +181,7 @@ def test_a_classical_body_heats_a_bath_whose_temperature_is_driven():
     assert run.x[-1, -1] > run.x[0, -1]
 
 
+@pytest.mark.slow
 def test_a_temperature_that_depends_on_time_has_its_conditions():
     with pytest.raises(lt.InputError, match="capacity must be infinite"):
         lt.HeatBaths(1.0, warm_and_cool)

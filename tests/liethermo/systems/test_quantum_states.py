@@ -70,6 +70,7 @@ def test_a_pure_state_with_a_floor_is_refused_where_steps_would_be_wrong():
     assert abs(abs(dephasing.density(end)[0, 1]) - 0.48 * np.exp(-0.6)) <= 1e-11
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("driven", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_an_ensemble_refuses_what_a_single_run_refuses(driven):
     """Each trajectory by itself, and by the method too: stages without the gradient start there."""
@@ -117,6 +118,7 @@ def test_two_levels_relax_beside_a_third_one_far_below(method, coupling):
     assert run.audit().passed
 
 
+@pytest.mark.slow
 def test_a_bath_takes_the_heat_of_a_small_gap_between_large_energies():
     """Its temperature is that beside the two levels alone: heat is summed from differences of levels."""
     ends = []

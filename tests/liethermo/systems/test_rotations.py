@@ -207,6 +207,7 @@ def test_bad_states_are_refused(arguments, message):
         lt.LiePoissonSystem(mf.sl(2), lt.Quadratic([1.0, 1.0, 1.0])).state(angular_velocity=[1.0, 0, 0])
 
 
+@pytest.mark.slow
 def test_ensembles_and_files_have_angular_velocities(tmp_path):
     inertias = np.array([[3.0, 2.0, 1.5], [3.0, 2.5, 1.0]])
     starts = Rotation.from_euler("z", [[0.1], [0.2]])

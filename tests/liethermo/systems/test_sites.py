@@ -74,6 +74,7 @@ def test_the_motion_is_that_of_the_same_algebra_by_constants():
     np.testing.assert_allclose(here.friction_matrix(x), other.friction_matrix(x), atol=1e-13)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("form", [np.eye(3), np.diag([1.0, 2.0, 3.0])])
 def test_a_form_of_one_site_acts_at_each(form):
     everywhere = np.kron(np.eye(6), form)

@@ -410,6 +410,7 @@ def test_a_motion_that_is_turned_around_goes_back(name):
     assert abs(returned.casimirs["work"][-1] + run.casimirs["work"][-1]) < 1e-13
 
 
+@pytest.mark.slow
 def test_an_energy_that_depends_on_time_has_an_attitude():
     """Its momentum in space is constant, since no torque acts; with one its impulse is taken off."""
     swelling = lambda mu, t: jnp.sum(mu**2 / (INERTIA * (1.0 + 0.2 * jnp.sin(t)))) / 2  # noqa: E731

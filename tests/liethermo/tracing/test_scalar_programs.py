@@ -148,6 +148,7 @@ def test_fixed_inputs_are_folded():
     assert program_of(f, matrix, v).operation_counts == {"mul": 9, "add": 6}
 
 
+@pytest.mark.slow
 def test_text_is_the_same_in_every_process():
     """The hash of the text is the key of a cache on disk."""
     script = """

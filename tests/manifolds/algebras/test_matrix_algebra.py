@@ -91,6 +91,7 @@ def test_suite_holds(pair):
     assert mf.testing.check_algebra(pair[0], degree=2).passed
 
 
+@pytest.mark.slow
 def test_the_representation_changes_with_the_size():
     su11 = mf.su(11)
     assert type(su11) is mf.LieAlgebra
