@@ -67,11 +67,14 @@ def test_each_member_of_the_table_exists_and_is_described():
     assert absent == []
 
 
-@pytest.mark.parametrize("name", CLASSES)
-def test_a_class_has_an_entry_or_few_members(name):
-    owner = CLASSES[name]
-    if not api_members.has_entry(owner):
-        assert len(api_members.public_members(owner)) <= api_members.MAX_MEMBERS_WITHOUT_ENTRY
+def test_a_class_has_an_entry_or_few_members():
+    counts = {
+        name: len(api_members.public_members(owner))
+        for name, owner in CLASSES.items()
+        if not api_members.has_entry(owner)
+    }
+    assert len(counts) > 50
+    assert [name for name, count in counts.items() if count > api_members.MAX_MEMBERS_WITHOUT_ENTRY] == []
 
 
 def test_the_page_of_a_lie_poisson_system_shows_what_users_call():
@@ -167,15 +170,16 @@ MAX_LINES_WITH_INTERNALS = 100
 """Lines of the help of a class that lists its internals: about two screens."""
 
 
-@pytest.mark.parametrize("name", CLASSES)
-def test_help_lists_no_internals(name):
+def test_help_lists_no_internals():
     """Only named tuples and exceptions, whose type Python fixes, and small classes list their internals."""
-    owner = CLASSES[name]
-    text = pydoc.render_doc(owner, renderer=pydoc.plaintext)
-    if isinstance(owner, ListedType | ListedEnumType):
-        assert INTERNAL_NAME.findall(text) == []
-    else:
-        assert issubclass(owner, tuple | Exception) or text.count("\n") <= MAX_LINES_WITH_INTERNALS
+
+    def lists_internals(owner):
+        text = pydoc.render_doc(owner, renderer=pydoc.plaintext)
+        if isinstance(owner, ListedType | ListedEnumType):
+            return INTERNAL_NAME.search(text)
+        return not issubclass(owner, tuple | Exception) and text.count("\n") > MAX_LINES_WITH_INTERNALS
+
+    assert [name for name, owner in CLASSES.items() if lists_internals(owner)] == []
 
 
 def test_help_of_an_enumeration_lists_its_members():
