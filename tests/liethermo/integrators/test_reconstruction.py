@@ -409,7 +409,7 @@ UNIT_TEST_METHODS = {
 )
 def test_the_unit_of_momentum_does_not_turn_the_body(method, kind, engine, step):
     """Momenta of 1e20 and of 1e-20 beside attitudes of size 1: a common tolerance would spoil one of them."""
-    start, T = np.array([0.3, 0.01, 1.0]), 300.0 if engine == "compiled" else 60.0
+    start, T = np.array([0.3, 0.01, 1.0]), 300.0 if engine == "compiled" else 10.0
     runs = []
     for scale in (1.0, 2.0**66, 2.0**-66):
         system = rubbing_body(scale, kind, rate=1e-4)
