@@ -90,15 +90,8 @@ class Tree(metaclass=ListedType):
     ...     "bob", mass=1.0, centre=(0.0, 0.0, -0.5), parent="ceiling", joint=hinge
     ... )
     >>> pendulum = tree.system(gravity=(0.0, 0.0, -9.81))
-    >>> swing = lt.integrate(
-    ...     pendulum,
-    ...     pendulum.state(joints={"bob": 0.3}),
-    ...     (0.0, 5.0),
-    ...     0.05,
-    ...     lt.MetriplecticGauss(2),
-    ... )
-    >>> swing.audit().passed
-    True
+    >>> pendulum.state(joints={"bob": 0.3}).shape
+    (2,)
     """
 
     def __init__(self, ground: str | None = None) -> None:
@@ -216,8 +209,6 @@ class Tree(metaclass=ListedType):
         Raises
         ------
         InputError
-            If the tree has no joint, a joint moves no inertia, or a motor belongs to no joint; or if a torque or an
-            orbit is given for a tree on the ground.
         """
         if gravity is not None and not isinstance(gravity, Orbit):
             gravity = checked_finite(gravity, "gravity", 3)

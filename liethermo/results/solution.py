@@ -285,7 +285,6 @@ class Solution(AuditableResult):
         Raises
         ------
         InputError
-            If the name of a tolerance is unknown, or a tolerance is negative.
 
         Examples
         --------

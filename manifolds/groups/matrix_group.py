@@ -126,13 +126,12 @@ class MatrixGroup(metaclass=ListedType):
         n : int
             The size of the matrices.
         name : str
+            The name in messages.
 
         Raises
         ------
-        ParameterError
-            If f does not vanish at the identity, has no derivative there, or no other solutions nearby.
-        ClosureError
-            If the kernel is no algebra, or exponentials of its elements are no solutions.
+        ParameterError, ClosureError
+            If f does not vanish at the identity or its solutions nearby do not form a group.
 
         Examples
         --------
@@ -234,17 +233,15 @@ class MatrixGroup(metaclass=ListedType):
         Returns
         -------
         array, shape (..., dim)
-            Accurate to rounding; where the logarithm itself is ill-conditioned, as for a pair of eigenvalues at the
-            angles +-(pi - d) in a noncompact group, to about 1e-15/d. Its derivative is that of x along the group:
-            changes of g that leave the group are projected out. A half turn has two logarithms, pi times an axis and
-            its negative: the one is returned whose first component that is not zero (1e-8 of the axis) is positive.
-            That holds up to 1e-8 from the half turn, where the angle may be larger than pi by as much. More than one
-            plane turned by pi, and -I in SU(2), have a continuum of logarithms with nothing to choose one by.
+            Accurate to rounding, but only to about 1e-15/d for a pair of eigenvalues at the angles +-(pi - d) in a
+            noncompact group. Derivatives are those along the group. A half turn (within 1e-8) has two logarithms; the
+            first nonzero component of the one returned is positive.
 
         Raises
         ------
         DomainError
-            If g is not in the group, or has no principal logarithm. Under tracing the result is NaN instead.
+            If g is not in the group, or has no single principal logarithm, such as -I in SU(2). Under tracing the
+            result is NaN instead.
         """
         g = self._element(g, "g")
         x = _log(self, g)
@@ -374,11 +371,7 @@ class MatrixGroup(metaclass=ListedType):
         Parameters
         ----------
         g : array, shape (..., m, m)
-        mu : array, shape (..., dim)
-
-        Returns
-        -------
-        array, shape (..., dim)
+        mu : array, shape (..., dim); the result has the same shape
         """
         return jnp.einsum("...ab,...a->...b", self.Ad(g), self._components(mu, "mu"))
 
