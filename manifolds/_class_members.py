@@ -51,7 +51,8 @@ add_class_members(
             from_brackets bracket ad ad_star hat vee casimirs
             / killing_form is_semisimple from_structure_constants from_matrices casimir_count killing_signature
             killing_inner_product cartan_involution is_abelian is_solvable is_nilpotent is_unimodular is_compact_type
-            derived_series lower_central_series isomorphism_type change_of_basis with_basis_names with_invariants poisson_tensor
+            derived_series lower_central_series isomorphism_type change_of_basis with_basis_names with_invariants
+            poisson_tensor
             """,
         "StructureMethods": """
             / centre derived_ideals lower_central_ideals derivations radical nilradical levi_decomposition index
