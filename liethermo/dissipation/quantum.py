@@ -105,11 +105,11 @@ class ThermalJumps(Dissipation):
     operators: tuple[Operator, ...] = eqx.field(static=True)
     rates: tuple[Any, ...]
     bath: int = eqx.field(static=True)
-    jumps: tuple[Jump, ...] = eqx.field(static=True)
-    jump_frame: Operator | None = eqx.field(static=True)
-    level_order: tuple[int, ...] = eqx.field(static=True)
+    jumps: tuple[Jump, ...] = eqx.field(static=True, repr=False)
+    jump_frame: Operator | None = eqx.field(static=True, repr=False)
+    level_order: tuple[int, ...] = eqx.field(static=True, repr=False)
     is_driven: bool = eqx.field(static=True)
-    timed_rates: tuple[int, ...] = eqx.field(static=True)
+    timed_rates: tuple[int, ...] = eqx.field(static=True, repr=False)
     is_isolated: bool = eqx.field(static=True)
     conserves_energy: bool = eqx.field(static=True)
 

@@ -404,7 +404,7 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
     rows.append(
         AuditRow(
             STEPS_TAKEN_ROW,
-            float(stats.steps),
+            stats.steps,
             None,
             False if has_failed else None,
             "" if status.ok else str(status.code),

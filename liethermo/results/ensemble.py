@@ -329,7 +329,7 @@ class Ensemble(AuditableResult):
         if self.evidence_source is not None or self.evidence.local_error is not None:
             rows.append(accuracy_row(self.evidence, limits))
         n_failed = int((~self.ok & (self.status != StatusCode.INTERRUPTED)).sum())
-        rows.append(AuditRow(FAILED_TRAJECTORIES_ROW, float(n_failed), 0.0, n_failed == 0))
+        rows.append(AuditRow(FAILED_TRAJECTORIES_ROW, n_failed, 0, n_failed == 0))
         min_entropy_increment = (
             np.nan if self.entropy is None else float(self.least_entropy_increment.min(initial=0.0, where=has_stepped))
         )
@@ -339,6 +339,10 @@ class Ensemble(AuditableResult):
         return Audit(drift, min_entropy_increment, casimir_drift, residual, tuple(rows), coverage)
 
     # -- files --------------------------------------------------------------------------------------------------------
+
+    def __repr__(self) -> str:
+        completed = int(np.sum(self.ok))
+        return f"Ensemble({len(self.status)} trajectories to t = {np.max(self.end_time):g}, {completed} completed)"
 
     def to_xarray(self, units: Mapping[str, str] | None = None) -> xarray.Dataset:
         """Return an ``xarray.Dataset`` with coordinates ``trajectory`` and ``time``; all else is in attributes (JSON).

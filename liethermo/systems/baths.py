@@ -21,7 +21,7 @@ from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers
 from ..functions.energy import Energy, Sum
 from ..functions.mechanics import Each
-from ..tracing.short_form import short_form
+from ..tracing.short_form import arguments_form
 
 
 class HeatBaths(Module):
@@ -73,7 +73,10 @@ class HeatBaths(Module):
     energy: Energy
     number: int = eqx.field(static=True)
 
-    __repr__ = short_form
+    def __repr__(self) -> str:
+        if isinstance(self.energy, BathEnergy):
+            return f"HeatBaths({arguments_form(vars(self.energy))})"
+        return f"HeatBaths({arguments_form(vars(self))})"
 
     def __init__(self, capacity=1.0, temperature=1.0, number: int | None = None, energy=None):
         if number is None:
