@@ -95,7 +95,7 @@ def load(path: str | os.PathLike, system: T) -> T:
     if metadata.get("kind") != system.kind or shapes[0] != shapes[1]:
         raise FileError(
             f"{path!s:.200} holds a {metadata.get('kind')} with {len(saved_leaves)} arrays, which does not match the "
-            f"number and shapes of the {len(leaves)} of this {system.kind}: pass a system built like the saved one"
+            f"number and shapes of the {len(leaves)} of this {system.kind}. Pass a system built like the saved one"
         )
     loaded_system = eqx.combine(jax.tree_util.tree_unflatten(structure, list(map(jnp.asarray, saved_leaves))), static)
     if not all(np.isfinite(x).all() for x in saved_leaves if x.dtype.kind == "f"):

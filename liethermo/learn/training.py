@@ -273,7 +273,7 @@ class Training(metaclass=ListedType):
         ]
         if undetermined:
             messages.append(
-                f"the data do not determine {', '.join(undetermined)}: give more data, or leave known numbers out of "
+                f"the data do not determine {', '.join(undetermined)}. Give more data, or leave known numbers out of "
                 "the fit"
             )
         max_residual = MAX_RESIDUAL_TO_NOISE
@@ -421,7 +421,7 @@ class TrainingRun:
             if not np.isfinite(loss):
                 raise InputError(
                     f"the loss is {loss} after {step} steps, in the {phase.name}: the runs leave the domain of the "
-                    "functions or the steps are too long; try a smaller rate, or more substeps"
+                    "functions or the steps are too long. Try a smaller rate, or more substeps"
                 )
             self.evaluations_since_best = (
                 0 if compared_loss < IMPROVEMENT_FACTOR * self.best_loss else self.evaluations_since_best + 1

@@ -427,7 +427,7 @@ def _check_pivots(mechanism: ArticulatedBodies, joint_ranges: list[JointRange]) 
             scale = np.sum(mechanism.masses) if mechanism.slides[i] else max(scales[i], inertia_scale)
             if not pivots[i] > MIN_PIVOT_FRACTION * scale:
                 raise InputError(
-                    f"the joint of {name!r} moves no inertia, so its motion is undefined: give the body an inertia, or "
+                    f"the joint of {name!r} moves no inertia, so its motion is undefined. Give the body an inertia, or "
                     "a centre of mass off the axis"
                 )
     if mechanism.is_fixed:
@@ -435,7 +435,7 @@ def _check_pivots(mechanism: ArticulatedBodies, joint_ranges: list[JointRange]) 
     moments = np.linalg.eigvalsh(M[:3, :3] - M[:3, 3:] @ np.linalg.solve(M[3:, 3:], M[3:, :3]))
     if not moments[0] > MIN_PIVOT_FRACTION * inertia_scale:
         raise InputError(
-            "the tree has no inertia about an axis if its joints are free, so its motion is undefined: give the base "
+            "the tree has no inertia about an axis if its joints are free, so its motion is undefined. Give the base "
             "an inertia"
         )
 

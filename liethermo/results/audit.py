@@ -469,7 +469,7 @@ def accuracy_row(evidence: Evidence, tolerances: Tolerances) -> AuditRow:
     row = _judged_row(ACCURACY_ROW, evidence.local_error, tolerances.accuracy)
     location = f"largest local error, relative to the length of the step; worst at t = {evidence.error_time:.4g}"
     return replace(
-        row, note=location if row.passed else f"the steps do not resolve the motion: try suggest_step; {location}"
+        row, note=location if row.passed else f"the steps do not resolve the motion. Try suggest_step; {location}"
     )
 
 

@@ -86,7 +86,7 @@ def write_csv(
     """
     q = quaternions(solution, scalar)
     if q.shape != (*np.shape(solution.t), 4):
-        raise InputError("a file has one history: write each trajectory of an ensemble, write_csv(path, e[i])")
+        raise InputError("a file has one history. Write each trajectory of an ensemble, write_csv(path, e[i])")
     quaternion_names = QUATERNION_COLUMNS if scalar == "last" else np.roll(QUATERNION_COLUMNS, 1).tolist()
     names, columns = ["t [s]", *quaternion_names], [np.asarray(solution.t)[:, None], q]
     if "angular_velocity" in solution.velocity_sources:

@@ -334,7 +334,7 @@ class Study(metaclass=ListedType):
         except InputError as error:
             differences = [str(error)]
         if differences:
-            head = f"{self.store} is the store of another study; take another name for this one:"
+            head = f"{self.store} is the store of another study. Use another name for this one:"
             raise InputError("\n  ".join([head, *differences]))
         return store, axes
 

@@ -83,7 +83,7 @@ class HeatBaths(Module):
             sequences = [v for v in (capacity, temperature, energy) if isinstance(v, list | tuple) or np.ndim(v) == 1]
             number = max(map(len, sequences), default=1)
         if isinstance(number, bool) or not isinstance(number, int) or number < 1:
-            raise InputError(f"the number of baths is a positive integer, not {number!r}")
+            raise InputError(f"the number of baths must be a positive integer, got {number!r}")
         self.number = number
         if callable(energy):
             self.energy = Each(_BathEnergyFunction(energy), np.arange(number)[:, None])
@@ -105,7 +105,7 @@ class HeatBaths(Module):
         for i in driven:
             if not is_traced(C) and np.isfinite(C[i]):
                 raise InputError(
-                    f"the temperature of bath {i} is a function of the time, so its capacity must be infinite, not "
+                    f"the temperature of bath {i} is a function of the time, so its capacity must be infinite, got "
                     f"{float(C[i]):g}. Set capacity=np.inf"
                 )
         terms: list[Energy] = [
@@ -144,7 +144,7 @@ def _entries_of_baths(value, what: str, number: int) -> list:
     if not isinstance(value, list | tuple):
         return [value] * number if np.ndim(value) == 0 else list(value)
     if len(value) != number:
-        raise InputError(f"the {what} of {number} baths has an entry for each, not {len(value)} entries")
+        raise InputError(f"the {what} of {number} baths must have one entry per bath, got {len(value)}")
     return list(value)
 
 
@@ -181,10 +181,10 @@ def _check_positive(value, what: str, number: int, infinite: bool) -> jax.Array:
         array = checked_numbers(value, f"the {what} of baths")
         array = jnp.broadcast_to(array, (number,)) if array.ndim == 0 else array
     if array.shape != (number,):
-        raise InputError(f"the {what} of {number} baths is one number, or has shape ({number},), not {array.shape}")
+        raise InputError(f"the {what} of {number} baths must be a number or have shape ({number},), got {array.shape}")
     if not is_traced(array) and not all(a > 0.0 and (infinite or np.isfinite(a)) for a in array.tolist()):
         allowed = "positive" if infinite else "positive and finite"
-        raise InputError(f"the {what} of a bath must be {allowed}, not {array.tolist()}")
+        raise InputError(f"the {what} of a bath must be {allowed}, got {array.tolist()}")
     return array
 
 

@@ -238,7 +238,7 @@ class EulerPoincareClosedSystem(LedgerSystem):
     ):
         if not isinstance(algebra, mf.LieAlgebra):
             raise InputError(
-                f"the algebra must be a manifolds.LieAlgebra, such as mf.so(3), not {type(algebra).__name__}"
+                f"the algebra must be a manifolds.LieAlgebra, such as mf.so(3), got {type(algebra).__name__}"
             )
         n = algebra.dim
         checked_energy(make_energy(lambda x: lagrangian(x[:n], x[n]), "the Lagrangian"), n + 1, "the Lagrangian")

@@ -56,7 +56,7 @@ class VelocityContactSystem(ContactManifoldSystem):
         if dim is None and space is None and isinstance(L, Quadratic):
             dim = L.A.shape[0]
         if dim is None and space is None:
-            raise InputError("the dimension of the state (q, v, S) is not known: give dim=2n+1 beside the Lagrangian")
+            raise InputError("the dimension of the state (q, v, S) is not known. Give dim=2n+1 beside the Lagrangian")
         dim = state_dim(dim, space)
         n = n_degrees_of_freedom(dim)
         self.lagrangian = L = with_polynomial_degrees(checked_energy(L, dim, "the Lagrangian"), dim)

@@ -129,7 +129,7 @@ class QuantumSystem(System):
         times=None,
     ):
         if not isinstance(baths, HeatBaths | None):
-            raise InputError(f"baths must be lt.HeatBaths(...), not {type(baths).__name__}")
+            raise InputError(f"baths must be lt.HeatBaths(...), got {type(baths).__name__}")
         self.time = None
         size, energy = hamiltonian_energy(hamiltonian, times)
         self.structure = structure = mf.DensityMatrices(size)
@@ -137,7 +137,7 @@ class QuantumSystem(System):
         entropy = VonNeumann() if entropy is None else entropy
         if not isinstance(entropy, VonNeumann):
             raise InputError(
-                f"the entropy of a density matrix must be lt.VonNeumann(...), not {type(entropy).__name__}"
+                f"the entropy of a density matrix must be lt.VonNeumann(...), got {type(entropy).__name__}"
             )
         self.floor = entropy.floor
         terms = _checked_terms(dissipation)
@@ -204,7 +204,7 @@ class QuantumSystem(System):
         front, m = matrices.shape[:-2], self.dim - self.body_dim
         y = np.zeros((*front, m)) if entropies is None else np.asarray(entropies, dtype=np.float64)
         if y.shape[-1:] != (m,):
-            raise InputError(f"the entropies of {m} baths have shape (..., {m}), not {y.shape}")
+            raise InputError(f"the entropies of {m} baths must have shape (..., {m}), got {y.shape}")
         x = np.asarray(self.structure.vector(matrices))
         return jnp.asarray(np.concatenate([x, np.broadcast_to(y, (*front, m))], axis=-1))
 
@@ -236,7 +236,7 @@ class QuantumSystem(System):
         """Return the density matrices, shape (..., N, N), of states, shape (..., n)."""
         x = jnp.asarray(x)
         if x.shape[-1:] not in ((self.dim,), (self.body_dim,)):
-            raise InputError(f"a state of this system has shape (..., {self.dim}), not {x.shape}")
+            raise InputError(f"a state of this system must have shape (..., {self.dim}), got {x.shape}")
         return self.structure.matrix(x[..., : self.body_dim])
 
     def reduced(self, x, part: int | str) -> jax.Array:
@@ -251,7 +251,7 @@ class QuantumSystem(System):
         k = self.names.index(part) if part in self.names else part
         if isinstance(k, bool) or not isinstance(k, int) or not 0 <= k < len(self.parts):
             raise InputError(
-                f"the parts are 0 to {len(self.parts) - 1}, or {self.names or 'without names'}, not {part!r}"
+                f"part must be 0 to {len(self.parts) - 1}, or one of the names {self.names or '()'}, got {part!r}"
             )
         n_before, n_part = math.prod(self.parts[:k]), self.parts[k]
         rho = self.density(x)
@@ -449,7 +449,7 @@ class QuantumSystem(System):
             The time, if the Hamiltonian depends on it.
         """
         if self.baths is None:
-            raise InputError("this system has no baths: give it baths=lt.HeatBaths(...) and lt.ThermalJumps")
+            raise InputError("this system has no baths. Give it baths=lt.HeatBaths(...) and lt.ThermalJumps")
         return -self.temperatures(x, t) * self.vector_field(x, t)[..., self.body_dim :]
 
     def entropy_production(self, x, t=None) -> jax.Array:
@@ -545,14 +545,14 @@ class QuantumSystem(System):
             for term in s.total_dissipation.terms:
                 if not isinstance(term, ThermalJumps):
                     raise InputError(
-                        f"{type(term).__name__} of a part is none of a product: give it to the product as a whole"
+                        f"{type(term).__name__} of a part is none of a product. Give it to the product as a whole"
                     )
                 operators = [tensor_with_identity(np.asarray(V), k, sizes) for V in term.operators]
                 terms.append(term.replace_operators(operators, term.bath + offset))
             offset += s.dim - s.body_dim
         if (self.baths is None) != (other.baths is None) and all(s.total_dissipation.terms for s in systems):
             raise InputError(
-                "the jumps of one part have a bath, but those of the other none: give baths to both parts or to neither"
+                "the jumps of one part have a bath, but those of the other none. Give baths to both parts or to neither"
             )
         H = [s._constant_hamiltonian() for s in systems]
         total_H = tensor_with_identity(H[0], 0, sizes) + tensor_with_identity(H[1], 1, sizes)
@@ -585,8 +585,8 @@ def _checked_terms(dissipation) -> tuple[Dissipation, ...]:
     for term in terms:
         if not isinstance(term, ThermalJumps | SteepestEntropyAscent | LindbladJumps):
             raise InputError(
-                f"the dissipation of density matrices is lt.ThermalJumps or lt.SteepestEntropyAscent, or "
-                f"lt.LindbladJumps without these laws, not {type(term).__name__}"
+                "the dissipation of a density matrix must be lt.ThermalJumps, lt.SteepestEntropyAscent or "
+                f"lt.LindbladJumps, got {type(term).__name__}"
             )
     return terms
 

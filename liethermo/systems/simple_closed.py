@@ -246,7 +246,7 @@ class SemibasicForm(Module):
     def from_function(cls, eta, shape: tuple[int, ...]) -> SemibasicForm:
         """Return the checked form of a user's function, for q and v of a shape."""
         if not callable(eta):
-            raise InputError(f"eta is a function of (q, v, S) to the components of a one-form, not {eta!r}")
+            raise InputError(f"eta must be a function of (q, v, S) that returns a one-form, got {eta!r}")
         is_implicit, n = required_argument_count(eta) == 4, math.prod(shape)
         function = eta if is_implicit else LastArgumentIgnored(eta)
         function = function if len(shape) == 1 else FlattenedFunction(function, shape)

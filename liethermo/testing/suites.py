@@ -55,7 +55,7 @@ def random_start(system: System, seed: int) -> np.ndarray:
     for x in system.samples(20, seed):
         if not system.domain.why_outside(jnp.asarray(x)) and np.isfinite(_field_at_time_zero(system, x)).all():
             return np.asarray(x)
-    raise ValueError(f"none of 20 random states is inside the domain of this {system.kind}: give x0")
+    raise ValueError(f"none of 20 random states is inside the domain of this {system.kind}. Give x0")
 
 
 def default_step(system: System, x0) -> float:
@@ -300,7 +300,7 @@ def check_dissipation(dissipation: Dissipation | System, algebra: mf.LieAlgebra 
 def _test_system(dissipation: Dissipation, g: mf.LieAlgebra) -> LiePoissonSystem:
     quadratic = g.casimirs(2)
     if not quadratic:
-        raise ValueError(f"{g.name} has no quadratic Casimir: give a system that has the dissipation")
+        raise ValueError(f"{g.name} has no quadratic Casimir. Give a system that has the dissipation")
     weights = np.linspace(1.0, 2.0, g.dim)
 
     def energy(mu):

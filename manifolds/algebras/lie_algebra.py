@@ -461,7 +461,7 @@ class LieAlgebra(StructureMethods):
 
         """
         if degree is not None and max_degree is not None:
-            raise ParameterError("casimirs takes degree or max_degree, not both; give one of them")
+            raise ParameterError("casimirs takes degree or max_degree, not both. Give one of them")
         if degree is not None:
             return self._casimirs_of_degree(degree)
         return casimirs_up_to(self, DEFAULT_MAX_DEGREE if max_degree is None else max_degree)
@@ -576,5 +576,5 @@ def trilinear_form(algebra: LieAlgebra, form=None) -> np.ndarray:
     if form.shape != (algebra.dim, algebra.dim):
         raise ShapeError(f"the form on {algebra.name} must have shape ({algebra.dim}, {algebra.dim}), got {form.shape}")
     if not np.isfinite(form).all():
-        raise ComponentError(f"the form on {algebra.name} must be finite, not {form.tolist()}")
+        raise ComponentError(f"the form on {algebra.name} must be finite, got {form.tolist()}")
     return np.einsum("ae,bde->abd", form, np.asarray(algebra.structure_constants))

@@ -385,7 +385,7 @@ class MatrixGroup(metaclass=ListedType):
         matrix = square_matrices(g, self.matrix_size, label)
         if jnp.iscomplexobj(matrix) and not np.iscomplexobj(self.algebra._require_basis()):
             raise ComponentError(
-                f"{label} must be real for {self.name}, not {matrix.dtype}: take its real part if that is meant"
+                f"{label} must be real for {self.name}, got {matrix.dtype}. Take its real part if that is meant"
             )
         return matrix.astype(self.algebra._require_basis().dtype)
 
@@ -406,13 +406,13 @@ class MatrixGroup(metaclass=ListedType):
         if map_name == "logarithm" and self.is_complex and is_below_half_turn and abs(total := angles.sum()) > np.pi:
             return (
                 f"has eigenvalues whose angles sum to {total:.6g}, so its principal logarithm is not in "
-                f"{self.algebra.name}: take the logarithm of g relative to a nearer element h, that is of "
+                f"{self.algebra.name}. Use the logarithm of g relative to a nearer element h, that is of "
                 "compose(inverse(h), g)"
             )
         eigenvalue = eigenvalues[np.abs(np.angle(eigenvalues)).argmax()]
         return (
             f"has the eigenvalue {eigenvalue:.6g} at the angle {abs(np.angle(eigenvalue)):.10f}, and det g = "
-            f"{np.linalg.det(g):.3g}; the {requirement}: take the {map_name} of g relative to a nearer element h, that "
+            f"{np.linalg.det(g):.3g}; the {requirement}. Use the {map_name} of g relative to a nearer element h, that "
             "is of compose(inverse(h), g)"
         )
 

@@ -314,7 +314,7 @@ class Space(SpaceMaps):
         array = jnp.asarray(numeric_array(x, label))
         if jnp.iscomplexobj(array) and self.dtype.kind != "c":
             raise ComponentError(
-                f"{label} must be real for {self.name}, not {array.dtype}: take its real part if that is meant"
+                f"{label} must be real for {self.name}, got {array.dtype}. Take its real part if that is meant"
             )
         if array.shape[array.ndim - len(self.shape) :] != self.shape or array.ndim < len(self.shape):
             expected_shape = f"(..., {', '.join(map(str, self.shape))})"

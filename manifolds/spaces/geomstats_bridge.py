@@ -62,7 +62,7 @@ def from_geomstats(space, injectivity_radius: float | None = None) -> GeomstatsS
         raise SpaceError(f"from_geomstats(space): space must be a geomstats manifold, got {type(space).__name__}")
     if not backend.__name__.endswith("numpy"):
         raise SpaceError(
-            f"geomstats must run with NumPy, got the backend {backend.__name__}; set GEOMSTATS_BACKEND=numpy"
+            f"geomstats must run with NumPy, got the backend {backend.__name__}. Set GEOMSTATS_BACKEND=numpy"
         )
     if getattr(space, "metric", None) is None:
         raise SpaceError(f"{_name(space)} has no metric: equip it with one, space.equip_with_metric(...)")

@@ -101,7 +101,7 @@ class LevelSet(Space):
             largest_value = float(np.nanmax(np.asarray(singular_values), initial=0.0))
             raise SpaceError(
                 f"{self.name}: its constraints depend on each other: of their gradients, made unit vectors, the least "
-                f"singular value is at most {largest_value:.1e} at {N_RANDOM_TRIALS} random arrays; leave one out"
+                f"singular value is at most {largest_value:.1e} at {N_RANDOM_TRIALS} random arrays. Leave one out"
             )
         points = self._call_compiled("_project", x)
         has_point = np.asarray(jnp.isfinite(points).all(axis=self._axes))
@@ -153,7 +153,7 @@ class LevelSet(Space):
         x, v = self._checked_point_and_vectors(x, v=v)
         end = self._call_compiled("_geodesic", x, v, static=(checked_size(steps, 1, "geodesic", "steps"),))
         if not bool(jnp.isfinite(end).all()):
-            raise DomainError(f"{self.name}: the geodesic could not be followed with {steps} steps: take more")
+            raise DomainError(f"{self.name}: the geodesic could not be followed with {steps} steps. Use more")
         return end
 
     # -- maps ---------------------------------------------------------------------------------------------------------

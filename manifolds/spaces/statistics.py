@@ -57,7 +57,7 @@ def frechet_mean(space: Space, points, weights=None) -> jax.Array:
         mean = space.exp(mean, step)
     raise DomainError(
         f"the mean on {space.name} did not come to rest: the last of {MAX_ITERATIONS} steps had the length "
-        f"{step_length:.3g}. The points may be too far apart for one mean: take points of a smaller region"
+        f"{step_length:.3g}. The points may be too far apart for one mean. Use points of a smaller region"
     )
 
 

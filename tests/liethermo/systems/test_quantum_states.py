@@ -415,7 +415,9 @@ BAD = {
     "term 1 of the Hamiltonian has shape": lambda q: lt.QuantumSystem([QUBIT, (np.eye(3), jnp.cos)]),
     "term 1 of the Hamiltonian is a matrix, or a pair": lambda q: lt.QuantumSystem([QUBIT, (X, 0.5)]),
     "term 0 of the Hamiltonian is a matrix, or a pair": lambda q: lt.QuantumSystem([[X, 0.5], QUBIT]),
-    "of term 1 of the Hamiltonian gives a real number": lambda q: lt.QuantumSystem([QUBIT, (X, lambda t: 1j * t)]),
+    "of term 1 of the Hamiltonian must return a real number": lambda q: lt.QuantumSystem(
+        [QUBIT, (X, lambda t: 1j * t)]
+    ),
     "the Hamiltonian, where it is a function, is one of the time": lambda q: lt.QuantumSystem(lambda: QUBIT),
     "is one of the time t alone: missing .* 's'": lambda q: lt.QuantumSystem([QUBIT, (X, lambda t, s: t)]),
     r"V\[0\] with the energy 1.3 .* = 3.39e\+27": lambda q: lt.QuantumSystem(
@@ -443,10 +445,12 @@ BAD = {
         QUBIT, lt.ThermalJumps([(LOWER, 1.0)], bath=1), baths=infinite()
     ),
     "or remove baths=": lambda q: lt.QuantumSystem(QUBIT, baths=infinite()),
-    "lt.ThermalJumps or": lambda q: lt.QuantumSystem(QUBIT, lt.DoubleBracket(1.0)),
-    r"the rate of V\[0\] is a number, or a function .* not to": lambda q: lt.ThermalJumps([(LOWER, lambda w, T: [w])]),
+    "must be lt.ThermalJumps": lambda q: lt.QuantumSystem(QUBIT, lt.DoubleBracket(1.0)),
+    r"rate of V\[0\] must be a number >= 0, or a function .* got": lambda q: lt.ThermalJumps(
+        [(LOWER, lambda w, T: [w])]
+    ),
     "at omega = 1 and T = 1 it is -1": lambda q: lt.ThermalJumps([(LOWER, lambda w, T: -1.0)]),
-    r"to a number >= 0: .*positional argument": lambda q: lt.ThermalJumps([(LOWER, lambda w: 1.0)]),
+    r"that returns one: .*positional argument": lambda q: lt.ThermalJumps([(LOWER, lambda w: 1.0)]),
     r"got an array of float64, shape \(0, 0\)": lambda q: lt.QuantumSystem(np.zeros((0, 0))),
     "the observable must have shape": lambda q: q.expectation(q.state(RHO), np.eye(3)),
     "mixed, .* from 0 to 1, got 'half'": lambda q: q.state(RHO, mixed="half"),
