@@ -6,8 +6,8 @@ A long boom with a tip mass points to the earth, since gravity pulls more strong
 with the mean motion n the pitch :math:`\theta` of a rigid satellite obeys :math:`\theta'' = -\tfrac32 \kappa n^2 \sin
 2\theta` with :math:`\kappa = (I_y - I_x) / I_z` [Hughes, *Spacecraft Attitude Dynamics*, 1986, chapter 9]. It librates
 at the frequency :math:`\sqrt{3 \kappa}\, n` for small angles, and it tumbles where the pitch rate exceeds
-:math:`\sqrt{3 \kappa}\, n` on the vertical. A hinge with a damper between satellite and boom takes the energy of the
-tumbling away, until the satellite is caught and the pitch decays.
+:math:`\sqrt{3 \kappa}\, n` on the vertical. A hinge with a damper between satellite and boom removes the energy of the
+tumbling, until the satellite is caught and the pitch decays.
 """
 
 import matplotlib.pyplot as plt
@@ -103,5 +103,5 @@ figure.tight_layout()
 # What is not reproduced
 # ----------------------
 #
-# The frequency and the limit of the pitch rate are Hughes'. The satellite is none that has flown: the friction of a
+# The frequency and the limit of the pitch rate are Hughes'. The satellite is fictitious: the friction of a
 # hinge in orbit and the bending of a boom are not known well enough to compare a capture with a flight.

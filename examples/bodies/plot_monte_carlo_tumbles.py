@@ -7,7 +7,7 @@ into a flat spin. The moments of inertia, the error of pointing at the separatio
 roughly, so the time of the fall is a distribution. The example runs 2,000 satellites and compares each with a closed
 form.
 
-The friction is not that of a named satellite: it was measured for none of this form. With weaker friction all times
+The friction is not that of a real satellite: no measurement exists for this shape. With weaker friction all times
 are longer by one factor, because the angle depends on the product of rate and time. :doc:`/tutorials/asteroid_wobble`
 compares a run with what was seen of Explorer 1.
 """

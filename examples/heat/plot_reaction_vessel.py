@@ -8,7 +8,7 @@ mixture warms the jacket of the vessel. The warmer it is, the less C there is in
 .. math::
    \frac{n_C}{n_A n_B} = K(T),
 
-has a constant that falls with the temperature. The system does not contain this law. It has an energy, an entropy, and
+has a constant that falls with the temperature. This law is not an input. The system has an energy, an entropy, and
 a reaction that acts as a friction between chemical potentials.
 """
 
@@ -34,7 +34,7 @@ def state(T, numbers):
 
 
 # %%
-# From mixtures of different temperatures, each with as many particles of A and B.
+# The runs start from mixtures of different temperatures, each with equally many particles of A and B.
 
 _, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.6), layout="constrained")
 found = []

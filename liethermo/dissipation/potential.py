@@ -43,7 +43,7 @@ class DissipationPotential(Dissipation):
     dS]`` in the algebra, and heat conduction has one force for each pair of bodies.
 
     If psi is convex with its minimum at zero, ``S' = (B^T dS) . grad psi(B^T dS) >= 0``, and ``B^T dH = 0`` for the
-    discrete gradient too: so every method keeps both laws as for K. The potential ``|f|^2 / 2`` gives K itself.
+    discrete gradient too: so every method obeys both laws as for K. The potential ``|f|^2 / 2`` gives K itself.
     ``system.check()`` tests that psi is convex with its minimum at zero, and building a system rejects any other psi.
     At a kink of psi the slope that JAX returns is used; the iterations of implicit methods need a continuous slope.
 

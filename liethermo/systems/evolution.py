@@ -119,7 +119,7 @@ class EvolutionSystem(MomentumContactSystem):
     For ``H = lt.Kinetic(G) + lt.Potential(V)``, that is ``p . G(q) p / 2 + V(q, S)`` with G semidefinite, it holds, and
     the metriplectic schemes keep it exactly: ``S' - S = h sum b_i p_i . G p_i >= 0`` at every step, for every V and h
     (not with the coordinate increment as printed, unless G is diagonal). Where the same H is written as one
-    plain function, they keep the energy exactly too, but the entropy may fall at a coarse step.
+    plain function, they conserve the energy exactly too, but the entropy may fall at a coarse step.
 
     Q is R^n, or a ``space``. There a state has the arrays of q and p in one row, and S behind them. The array p is that
     along Q which acts on velocities as the momentum does, ``sum(p * v)``. What energies are off Q counts for nothing.

@@ -186,7 +186,7 @@ class ChetaevSystem(SimpleClosedSystem):
     For ``eta = dS - L_v dq`` this is :class:`liethermo.ThermodynamicHerglotz` [SML Prop. 3.3], and for
     ``eta = T dS + F_fr dq`` a :class:`liethermo.SimpleClosedSystem` with the friction F_fr.
 
-    The metriplectic schemes keep the energy, and the sign of S' in each step, exactly.
+    The metriplectic schemes conserve the energy exactly, and S' >= 0 holds exactly in each step.
     :class:`liethermo.VariationalIntegrator` discretises the principle itself: D_1 L_d + D_2 L_d is a multiple of eta at
     the points of its finite difference maps, on which eta vanishes.
 
