@@ -471,7 +471,7 @@ class TrainingRun:
         metadata, arrays = read_archive(path, CHECKPOINT_FORMAT)
         if metadata.get("identity") != self.fit_fingerprint:
             raise FileError(
-                f"{path} is the checkpoint of a fit of another model, of other data or with other settings: give "
+                f"{path} is the checkpoint of a fit of another model, of other data or with other settings. Give "
                 "another path, or remove it"
             )
         self.phase_index, self.weights = metadata["index"], arrays["weights"]

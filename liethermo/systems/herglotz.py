@@ -67,8 +67,8 @@ class VelocityContactSystem(ContactManifoldSystem):
     def _hamiltonian(self) -> Energy:
         if self.configurations is not None:
             raise InputError(
-                f"the Legendre transform is inverted on R^n alone, and positions are in {self.configurations.name}: "
-                "give lt.EvolutionSystem or lt.ContactSystem the Hamiltonian, with space="
+                f"the Legendre transform is inverted on R^n alone, and positions are in {self.configurations.name}. "
+                "Give lt.EvolutionSystem or lt.ContactSystem the Hamiltonian, with space="
             )
         return _legendre_hamiltonian(self.lagrangian, self.dim)
 

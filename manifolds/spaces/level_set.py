@@ -117,8 +117,8 @@ class LevelSet(Space):
         if (gradient_ratios < MIN_GRADIENT_RATIO).any():
             i = int(np.argmin(gradient_ratios))
             raise SpaceError(
-                f"{self.name}: the gradient of constraint {i} vanishes on it, near {np.asarray(points)[has_point][0]}: "
-                "give a function that changes its sign there"
+                f"{self.name}: the gradient of constraint {i} vanishes on it, near {np.asarray(points)[has_point][0]}. "
+                "Give a function that changes its sign there"
             )
         if self.form is not None and self._call_compiled("_metric_at", x).shape[-2:] != (self.size, self.size):
             raise ParameterError(
