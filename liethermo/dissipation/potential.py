@@ -158,7 +158,9 @@ class CoulombFriction(NamedPotential):
     Parameters
     ----------
     strength : float, >= 0
+        Largest flux.
     width : float, > 0
+        Force below which the flux is linear.
     each : bool
         Apply the potential to every force by itself, or to their length (by default).
     """
@@ -186,7 +188,9 @@ class PowerLawFriction(NamedPotential):
     Parameters
     ----------
     exponent : float, > 1
+        p, the exponent of the potential.
     strength, width : float, >= 0
+        Coefficient, and the force below which the flux is linear.
     each : bool
         Apply the potential to every force by itself, or to their length (by default).
     """
@@ -220,7 +224,9 @@ class ActivatedFriction(NamedPotential):
     Parameters
     ----------
     rate : float, >= 0
+        Coefficient of the friction for small forces.
     scale : float, > 0
+        Force above which the flux grows exponentially.
     each : bool
         Apply the potential to every force by itself, or to their length (by default).
     """

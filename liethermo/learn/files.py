@@ -50,7 +50,9 @@ def save(system: System, path: str | os.PathLike) -> Path:
     Parameters
     ----------
     system : System
+        The system whose parameters are saved.
     path : path
+        The file to write.
 
     Raises
     ------
@@ -75,6 +77,7 @@ def load(path: str | os.PathLike, system: T) -> T:
     Parameters
     ----------
     path : path
+        The file to read.
     system : System
         A system built like the one that was fitted, such as by the same function, because the file holds arrays only.
         Its own arrays do not matter.

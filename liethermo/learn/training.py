@@ -89,6 +89,7 @@ class Training(metaclass=ListedType):
     step : ndarray of int, shape (evaluations,)
         Number of steps before each evaluation, summed over phases.
     phase : ndarray of str, shape (evaluations,)
+        Phase of each evaluation.
     loss : ndarray, shape (evaluations,)
         Mean loss of the steps since the last evaluation. Mean squares: in the matching relative to the speed of the
         state, in the shooting relative to the spread of the data or the noise.
@@ -125,6 +126,7 @@ class Training(metaclass=ListedType):
     noise : ndarray, shape (k,)
         Standard deviations of the errors of the data, given or estimated; empty if the data count as exact.
     noise_is_estimated : bool
+        True if the noise was estimated from the residuals.
     degrees_of_freedom : int
         Number of observations minus the number of determined unknowns of the least squares.
     initial_states : ndarray, shape (trajectories, n)

@@ -73,6 +73,7 @@ def toda_flow(n: int) -> LiePoissonSystem:
     Parameters
     ----------
     n : int, >= 2
+        Number of particles.
 
     Returns
     -------

@@ -154,6 +154,7 @@ class Audit(Tabular):
         tolerance ``accuracy``. It is about single steps and not about the accumulated error. None without information
         about the steps.
     rows : tuple of AuditRow
+        The rows of the table.
     coverage : str
         Number of steps that were checked, if not all; the verdict says it too.
 

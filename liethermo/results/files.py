@@ -66,6 +66,7 @@ def write_csv(
     Parameters
     ----------
     path : path
+        The file to write.
     solution : Solution
         A result of a body with attitudes in SO(3), with the second as its unit of time.
     degrees : bool
@@ -114,6 +115,7 @@ def read_csv(path: str | os.PathLike) -> AttitudeHistory:
     Parameters
     ----------
     path : path
+        The file to read.
 
     Returns
     -------

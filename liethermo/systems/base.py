@@ -46,10 +46,12 @@ class System(SystemInterface):
     Attributes
     ----------
     poisson : manifolds.PoissonStructure
+        The Poisson structure.
     energy, entropy : Energy
         Callable on states of shape (..., n), an energy that depends on time on a state and a time. ``entropy`` is None
         for a system without one.
     dissipation : Dissipation or None
+        The dissipation; None without one.
     momentum_maps : dict of Energy
         Further functions that are claimed to be conserved, by name.
     dim : int

@@ -73,6 +73,7 @@ class EulerPoincareSystem(LiePoissonSystem):
     Parameters
     ----------
     algebra : manifolds.LieAlgebra
+        The Lie algebra g of the velocities.
     lagrangian : function from xi, shape (dim,), to a scalar, or an Energy
         Its Hessian must be invertible (regular Lagrangian). It may depend on time, as a second argument.
     entropy, dissipation, momentum_maps, validate, group, reconstruction, torque
@@ -198,6 +199,7 @@ class EulerPoincareClosedSystem(LedgerSystem):
     Parameters
     ----------
     algebra : manifolds.LieAlgebra
+        The Lie algebra g of the velocities.
     lagrangian : function of (xi, S), xi of shape (dim,), to a scalar
         l, regular: ``l_xi xi`` has an inverse.
     friction : function of (xi, S), or of (xi, S, t), to a covector, shape (dim,); or a coefficient; optional

@@ -63,6 +63,7 @@ def attitude(
     matrix : array, shape (..., 3, 3), optional
         Rotation matrices.
     rotation : scipy.spatial.transform.Rotation, optional
+        The attitude, as SciPy represents it.
 
     Returns
     -------

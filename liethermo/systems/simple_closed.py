@@ -59,6 +59,7 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
     heat_power : function likewise to a scalar, or a number; optional
         P_H, the heat received per time (power).
     momentum_maps : dict of functions, or a sequence of them
+        Conserved quantities of a symmetry, functions of the state.
     validate : bool
         Test the axioms at a few random points, that friction brakes among them. Turn off where a function is not
         defined at normally distributed points, and use ``system.check(points=...)``.

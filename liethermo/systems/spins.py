@@ -62,15 +62,19 @@ class SpinSystem(TorqueSystem):
     Parameters
     ----------
     sites : int or tuple of int
+        Number of spins, or the shape of their lattice.
     energy : Energy or function from s, shape ``(*sites, 3)``, to a scalar
         Such as a sum of the terms in ``lt.magnetism``. May depend on time.
     dissipation : LandauLifshitz, or a list of dissipations that act together; optional
+        The damping; without it the spins precess only.
     baths : HeatBaths, optional
+        The baths that take the heat of the damping.
     ratio : float, or array of the shape of the sites
         gamma_i.
     momentum_maps : dict of functions, or a sequence of them
         Of s, shape ``(*sites, 3)``.
     validate : bool
+        Test the axioms at a few random points.
     torque : function w of t, shape (), and s, shape ``(*sites, 3)``; or a list of them; optional
         Torques ``s x w`` (w in 1 / time) from outside, such as ``lt.magnetism.Slonczewski``. Each |s_i| stays constant.
         The torque does the work W, ``W' = sum grad_i H . (s_i x w_i)``, and the energy less the work is constant.

@@ -65,12 +65,15 @@ def check_equilibrium(
     Parameters
     ----------
     system : System
+        The system to test.
     noise : Fluctuations
+        The noise to test.
     x0 : array, shape (n,), or (paths, n)
         Initial states of the paths, all on one level.
     time, step : float
         The time has to be several relaxation times.
     paths : int
+        Number of paths.
     moments : dict of functions from a state to a number, optional
         By default the components, their squares, and the entropy or the energy.
     samples : Samples, optional

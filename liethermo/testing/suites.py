@@ -226,11 +226,13 @@ def check_system(
     Parameters
     ----------
     system : System
+        The system to test.
     x0 : array, optional
         Initial state of the runs; a random one by default.
     step : float, optional
         By default a step moves the state by a hundredth of its norm.
     methods : sequence of OneStepMethod
+        The methods that are tried on it.
 
     Raises
     ------
@@ -320,6 +322,7 @@ def check_method(method: OneStepMethod, systems: Mapping[str, Problem] | None = 
     Parameters
     ----------
     method : OneStepMethod
+        The method to test.
     systems : dict of (system, x0, time), optional
         Test problems. By default a body and a semidirect product with non-quadratic energies, and an oscillator in R^n;
         for a method for one kind of system, the matching ones of :func:`problems_for`.

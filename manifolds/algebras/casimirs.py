@@ -56,6 +56,7 @@ class TracePolynomial:
     matrices : array of float, shape (dim, m, m)
         The X_a.
     degree : int
+        Degree of the polynomial.
     weight : array of float, shape (m, m), optional
         W, the identity by default.
     label : str

@@ -285,6 +285,7 @@ def bianchi(kind: str, h: float | None = None) -> LieAlgebra:
     Parameters
     ----------
     kind : "I" … "IX"
+        Type in Bianchi's list.
     h : float
         For VI (h <= 0; h = 0 is VI_0, h = -1 is III) and VII (h >= 0; h = 0 is VII_0) only, where it must be given.
 

@@ -562,6 +562,7 @@ def trilinear_form(algebra: LieAlgebra, form=None) -> np.ndarray:
     Parameters
     ----------
     algebra : LieAlgebra
+        The Lie algebra.
     form : array, shape (dim, dim), optional
         By default the Killing form, for which the tensor is totally skew.
 

@@ -34,6 +34,7 @@ def magnetic_extension(g: LieAlgebra, by_brackets: bool | None = None) -> LieAlg
     Parameters
     ----------
     g : LieAlgebra
+        The algebra to extend.
     by_brackets : bool, optional
         Whether the extension acts by the brackets of g, without structure constants of its own: by default above
         dimension 40.

@@ -37,6 +37,7 @@ class Polynomial(metaclass=ListedType):
     exponents : array of int, shape (terms, dim)
         One row for each monomial; equal rows are added up.
     coefficients : sequence of int, Fraction or float, length terms
+        Coefficients of the monomials.
 
     Attributes
     ----------

@@ -80,7 +80,9 @@ class MatrixGroup(metaclass=ListedType):
     Attributes
     ----------
     name : str
+        The name in messages.
     algebra : LieAlgebra
+        Its Lie algebra.
     defect : callable
         ``g -> array``, shape (...): the distance of g from the group relative to its size, of the order of the smallest
         relative change of g that brings it there. A function of one matrix is applied to each matrix of a batch.

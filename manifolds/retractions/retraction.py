@@ -239,6 +239,7 @@ class Place(NamedTuple):
     Attributes
     ----------
     point : array, shape ``(..., *shape)``
+        A point of the space.
     lift : function
         From a covector of R^dim, shape (..., dim), to the ambient covector with equal products with tangent vectors.
     lower : function

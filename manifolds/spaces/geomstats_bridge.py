@@ -83,6 +83,7 @@ class GeomstatsSpace(Space):
     Attributes
     ----------
     source : geomstats Manifold
+        The manifold of geomstats.
     """
 
     is_smooth = False

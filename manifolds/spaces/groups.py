@@ -420,6 +420,7 @@ class SpecialEuclidean(GroupSpace):
     Parameters
     ----------
     n : int
+        Dimension of the space of the motions.
     length : float
         The translation that counts as much as a rotation by one radian.
     """

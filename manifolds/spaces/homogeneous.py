@@ -42,6 +42,7 @@ class Homogeneous(Space):
     stabilizer : array, shape (k, n, n)
         Matrices that span the algebra of H, which is connected.
     name : str, optional
+        The name in messages.
 
     Raises
     ------

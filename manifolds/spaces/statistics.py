@@ -29,7 +29,9 @@ def frechet_mean(space: Space, points, weights=None) -> jax.Array:
     Parameters
     ----------
     space : Space
+        The space of the points.
     points : array, shape ``(..., *space.shape)``
+        The points.
     weights : array, shape (...), optional
         Not negative, with a positive sum.
 

@@ -390,6 +390,7 @@ def sphere_field(
     largest : float, optional
         The magnitude at which the colours end on both sides of zero; by default that of the values.
     title : str
+        Title of the figure.
 
     Raises
     ------

@@ -61,6 +61,7 @@ class ComposedSystem(System):
     Parameters
     ----------
     subsystems : sequence of Subsystem or Copies, or dict of them by name
+        The bodies.
     coupling : function of q, of (q, S) or of (q, S, t), or an Energy of the whole state; or a sequence of such
         V, with q the positions of all subsystems in one array and S their entropies, shape (N,). Where bodies hold
         matter a function of three arguments is one of (q, S, N), all their particle numbers in one array. An Energy may
@@ -77,10 +78,13 @@ class ComposedSystem(System):
         temperatures at the midpoint, as SML §6.2 prints them: then it is known to grow for quadratic energies alone,
         and no law of it is stated.
     membranes : sequence of Membrane
+        Membranes that particles pass.
     reactions : sequence of Reaction
+        Reactions within bodies.
     connected : bool
         Refuse a conductance whose graph falls into parts that exchange no heat.
     momentum_maps : dict of functions, or a sequence of them
+        Conserved quantities of a symmetry, functions of the state.
     validate : bool
         Test the axioms at a few random points. Turn off where an energy is not defined at normally distributed points,
         and use ``system.check(points=...)``.
