@@ -24,6 +24,12 @@ CODE_ELEMENT = re.compile(r"<(code|pre)\b.*?</\1>", re.DOTALL)
 LOST_PARAGRAPH = re.compile(r"(?<=[.:;)`])  +(?=\S)|(?<=\S) ##+ \w")
 """Two blanks where a paragraph began, or a heading within a line."""
 
+OUTPUT = re.compile(r'<div class="[^"]*(?:\boutput\b|script-out)[^"]*">.*?<pre>(.*?)</pre>', re.DOTALL)
+"""What a block of code prints."""
+
+MAX_DECIMALS = 10
+"""Decimals of a printed number: NumPy prints 8 of an array."""
+
 MAX_COLUMNS = 88
 """Columns of a line of code that a page of the site shows without a scroll bar."""
 
@@ -45,6 +51,13 @@ def raw_headings(page: str) -> Iterator[str]:
         text = html.unescape(TAG.sub("", paragraph))
         if re.search(r"(?:^|\s)##+ \w", text):
             yield f"a heading is shown as raw text: {' '.join(text.split())[:80]}"
+
+
+def unrounded_output(page: str) -> Iterator[str]:
+    """Yield the numbers that a block of code on a built page prints with more digits than a reader can use."""
+    for output in OUTPUT.findall(page):
+        for number in re.findall(rf"\d+\.\d{{{MAX_DECIMALS + 1},}}(?:e[+-]?\d+)?", TAG.sub("", output)):
+            yield f"a printed number has more than {MAX_DECIMALS} decimals: {number}"
 
 
 def lost_paragraphs(pages: Mapping[str, str]) -> Iterator[str]:

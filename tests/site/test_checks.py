@@ -27,6 +27,14 @@ def test_a_heading_that_stays_raw_is_found(check_text):
     assert problem.startswith("a heading is shown as raw text: A text.")
 
 
+def test_a_number_that_is_not_rounded_is_found(check_text):
+    page = "<p>0.123456789012</p><div class='a output'></div>"
+    page += '<div class="output highlight-text"><div class="highlight"><pre><span>{}</span></pre></div></div>'
+    assert list(check_text.unrounded_output(page.format("0.6768 [0.12345678]"))) == []
+    (problem,) = check_text.unrounded_output(page.format("0.676812345678912e-3"))
+    assert problem.endswith(": 0.676812345678912e-3")
+
+
 @pytest.mark.parametrize("line", ["One ends.  Another begins.", "A `name`.  Another.", "A text. ## A measurement"])
 def test_a_paragraph_that_begins_within_a_line_is_found(check_text, line):
     good_page = "## A heading\n\nA text. Another.\n\n```text\na.  b\n```\n\n| a.  | b |\n"
@@ -105,3 +113,20 @@ def test_text_that_a_narrow_screen_cuts_off_is_found(import_from_docs, tmp_path)
     with check_site.browser() as chromium:
         problems = check_site.check_pages(chromium, tmp_path)
     assert problems == ["wrong.html: cut off at 390 pixels: A sentence."]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("chromium"), reason="no Chromium on this machine")
+def test_a_picture_that_squeezes_text_is_found(import_from_docs, tmp_path):
+    check_site = import_from_docs("check_site")
+    page = (
+        "<meta name='viewport' content='width=device-width'><div class='bd-article'><img alt='A card' style='float: {}'"
+    )
+    page += (
+        " width='320' height='99' src='data:image/svg+xml,<svg xmlns=%22http://www.w3.org/2000/svg%22/>'><p>A text.</p>"
+    )
+    (tmp_path / "right.html").write_text(page.format("none"))
+    (tmp_path / "wrong.html").write_text(page.format("right"))
+    with check_site.browser() as chromium:
+        problems = check_site.check_pages(chromium, tmp_path)
+    assert [problem.partition(" a picture")[0] for problem in problems] == ["wrong.html: text squeezed beside"]
