@@ -48,8 +48,7 @@ class TracePolynomial:
 
     It represents a Casimir with too many monomials to expand. Like a :class:`Polynomial` it is immutable, hashable, a
     static leaf of a pytree, and callable on batches; JAX differentiates it (``jax.grad``). One value costs a few
-    products
-    of matrices.
+    products of matrices.
 
     Parameters
     ----------

@@ -215,8 +215,7 @@ class LieAlgebra(StructureMethods):
         """Return an equal algebra whose basis elements have names.
 
         Its Casimirs print with these names instead of ``mu1``, ``mu2``, …; pictures label their axes with them, and
-        sums of
-        algebras that all have names keep them.
+        sums of algebras that all have names keep them.
 
         Raises
         ------
@@ -368,10 +367,9 @@ class LieAlgebra(StructureMethods):
         """Return a Cartan involution theta, shape (dim, dim), for which ``-kappa(x, theta y)`` is positive definite.
 
         It is the identity on compact type. Otherwise it is computed without matrices: among all inner products of unit
-        volume,
-        the one that minimises the norm of the bracket satisfies ``ad_x^T = -ad_{theta x}`` [Lauret 2003]; the norm is
-        convex along the geodesics of inner products, so Newton's method finds it. For ``sl``, ``so`` and ``sp`` in
-        their usual bases theta is ``X -> -X^T``.
+        volume, the one that minimises the norm of the bracket satisfies ``ad_x^T = -ad_{theta x}`` [Lauret 2003]; the
+        norm is convex along the geodesics of inner products, so Newton's method finds it. For ``sl``, ``so`` and ``sp``
+        in their usual bases theta is ``X -> -X^T``.
 
         Raises
         ------

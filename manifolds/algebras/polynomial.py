@@ -29,8 +29,8 @@ class Polynomial(metaclass=ListedType):
     """Polynomial in the components ``mu1, mu2, …`` of ``mu``.
 
     Polynomials are immutable and hashable, hence static leaves of a pytree. Sums, differences and products with
-    polynomials
-    and numbers are polynomials; coefficients stay exact as long as every number involved is an integer or a fraction.
+    polynomials and numbers are polynomials; coefficients stay exact as long as every number involved is an integer or a
+    fraction.
 
     Parameters
     ----------

@@ -74,8 +74,7 @@ class MatrixGroup(metaclass=ListedType):
 
     Build one with its name (``manifolds.SO(3)``). A new group needs its algebra, with matrices, and ``defect``; the
     other maps default to general matrix functions. Before such a map is used, :meth:`map_defect` tests at random
-    elements
-    that it stays in the group.
+    elements that it stays in the group.
 
     Attributes
     ----------

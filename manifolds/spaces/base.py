@@ -51,12 +51,11 @@ class Space(SpaceMaps):
 
     A subclass is a frozen dataclass, decorated with ``jax.tree_util.register_static``. It implements ``name``, ``dim``,
     ``shape`` and ``_project``, and may override the other members that begin with an underscore; each is a plain JAX
-    function of checked arrays with leading batch axes. The tangent spaces follow from ``_project``, any smooth
-    map from arrays to points that leaves points unchanged; the metric is that of the ambient array unless ``_inner`` is
-    overridden. There are geodesics if ``_exp``, ``_log`` and ``_transport`` are given, with
-    :meth:`injectivity_radius`; a space without geodesics runs in the chart of a
-    :class:`manifolds.ProjectionRetraction`, or
-    of a chart of your own. A closed form is faster than a derived map: the native spaces have all of them.
+    function of checked arrays with leading batch axes. The tangent spaces follow from ``_project``, any smooth map from
+    arrays to points that leaves points unchanged; the metric is that of the ambient array unless ``_inner`` is
+    overridden. There are geodesics if ``_exp``, ``_log`` and ``_transport`` are given, with :meth:`injectivity_radius`;
+    a space without geodesics runs in the chart of a :class:`manifolds.ProjectionRetraction`, or of a chart of your own.
+    A closed form is faster than a derived map: the native spaces have all of them.
 
     Attributes
     ----------

@@ -42,8 +42,7 @@ def from_geomstats(space, injectivity_radius: float | None = None) -> GeomstatsS
         For example ``Hypersphere(2)`` or ``PoincareBall(2)``, with points of its own kind: see ``space.shape``.
     injectivity_radius : float, optional
         By default the radius of the metric, and infinite if the metric has none; for SO(n) and SE(n) pi and sqrt(2) pi,
-        as
-        geomstats 2.8 returns larger values than the true ones.
+        as geomstats 2.8 returns larger values than the true ones.
 
     Raises
     ------

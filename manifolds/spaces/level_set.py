@@ -141,8 +141,7 @@ class LevelSet(Space):
         """Return the point at time 1 of the geodesic from x with velocity v, shape ``shape``, by integration.
 
         The method takes classical Runge-Kutta steps for ``x' = sharp(p)``, ``p' = -d(p . sharp(p))/dx / 2``: the error
-        falls
-        like the fourth power of their number.
+        falls like the fourth power of their number.
 
         Parameters
         ----------

@@ -20,8 +20,7 @@ def frechet_mean(space: Space, points, weights=None) -> jax.Array:
     The iteration ``m <- exp(m, sum_i w_i log(m, x_i))`` starts from the point of the space nearest to the mean of the
     arrays, and ends when rounding stops it. The mean is unique for points in a ball of less than half the injectivity
     radius, and of less than ``pi / (4 sqrt(K))`` for sectional curvatures up to K > 0 [Karcher 1977]; for points
-    further
-    apart the result is a point at which the mean square distance is stationary.
+    further apart the result is a point at which the mean square distance is stationary.
 
     Under ``jax.jit``, ``vmap`` and derivatives the mean is NaN where these errors would be raised. Its first
     derivatives are exact, by the implicit function theorem; second ones are not defined.
