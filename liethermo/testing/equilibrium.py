@@ -158,7 +158,7 @@ def sample_exact_measure(system: System, noise: Fluctuations, x0, path_states: n
     invariants |= {name: system.functions()[name] for name in sorted(system.first_integrals()) if is_invariant[name]}
     if len(invariants) > 1:
         raise ValueError(
-            f"motion and noise conserve {', '.join(invariants)}. For more than one invariant give samples of the measure"
+            f"motion and noise conserve {', '.join(invariants)}. If there are several, give samples of the measure"
         )
     random, n = np.random.default_rng(seed), system.dim
     directions = random.standard_normal((N_EXACT_SAMPLES, n))
