@@ -161,7 +161,7 @@ def cylinder(
         Amount of the monatomic gas (mol), and the height of the piston (m) at which its entropy is 0 at 300 K.
     pressure : float, or function of (q, v, S) or (q, v, S, t) to a scalar; optional
         External pressure P (Pa).
-    heat_power : float, or function likewise; optional
+    heat_power : float, or function of (q, v, S) or (q, v, S, t) to a scalar; optional
         External heating power of the gas (W).
     """
     n, m, A = checked_positive(moles, "moles"), checked_positive(mass, "mass"), checked_positive(area, "area")

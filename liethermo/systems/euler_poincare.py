@@ -208,7 +208,7 @@ class EulerPoincareClosedSystem(LedgerSystem):
         semidefinite.
     external : function of the same arguments, or an array of shape (dim,); optional
         F, in the frame of the body.
-    heat_power : function likewise to a scalar, or a number; optional
+    heat_power : function of the same arguments to a scalar, or a number; optional
         P_H, the heat received per time (power).
     momentum_maps, validate
         As for :class:`System`; functions of (xi, S).

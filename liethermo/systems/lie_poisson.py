@@ -51,7 +51,7 @@ class LiePoissonSystem(TorqueSystem):
     energy : function from mu, shape ``algebra.shape``, to a scalar, or an Energy
         H, or a function of mu and the time t: see :class:`liethermo.TimeDependent`. It fixes the units: that of H over
         that of mu is 1 / time.
-    entropy : likewise, optional
+    entropy : function from mu to a scalar, or an Energy; optional
         S, a Casimir function of the algebra (checked), in any unit of entropy, or dimensionless.
     dissipation : Dissipation, or a list of them that act together; optional
         The part of the motion that produces entropy or lowers the energy.

@@ -54,9 +54,9 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
     friction : function of (q, v, S) or (q, v, S, t), to shape (n,); or a coefficient; optional
         F_fr, with ``F_fr . v <= 0`` (force). A coefficient R means ``F_fr = -R v``: a number, an array of shape (n,)
         for a diagonal matrix, or (n, n), whose symmetric part is positive semidefinite (mass / time).
-    external : function likewise, or an array of shape (n,); optional
+    external : function of (q, v, S) or (q, v, S, t), to shape (n,); or an array of shape (n,); optional
         F_ext (force).
-    heat_power : function likewise to a scalar, or a number; optional
+    heat_power : function of (q, v, S) or (q, v, S, t), to a scalar; or a number; optional
         P_H, the heat received per time (power).
     momentum_maps : dict of functions, or a sequence of them
         Conserved quantities of a symmetry, functions of the state.
