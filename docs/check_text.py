@@ -27,8 +27,8 @@ LOST_PARAGRAPH = re.compile(r"(?<=[.:;)`])  +(?=\S)|(?<=\S) ##+ \w")
 OUTPUT = re.compile(r'<div class="[^"]*(?:\boutput\b|script-out)[^"]*">.*?<pre>(.*?)</pre>', re.DOTALL)
 """What a block of code prints."""
 
-MAX_DECIMALS = 10
-"""Decimals of a printed number: NumPy prints 8 of an array."""
+MAX_DECIMALS = 14
+"""Decimals of a printed number: reference values have 14, and a number that nobody has rounded 15 or more."""
 
 MAX_COLUMNS = 88
 """Columns of a line of code that a page of the site shows without a scroll bar."""
