@@ -341,19 +341,21 @@ class QuantumSystem(System):
         kernels = self._kernels(rho)
         use = [i for i, kernel in enumerate(kernels) if kernel.size]
         turned = [self._is_kernel_rotated(rho[i], kernels[i]) for i in use]
-        mix = "mix it, as in q.state(rho, mixed=1e-6)"
+        mix = "Use system.state(rho, mixed=1e-6)"
         if self.floor > 0.0:
-            text = "eigenvalues of its density matrix are zero, and the Hamiltonian turns their eigenvectors: the ends "
-            text += f"of steps have others, by the error of a step, which steepest ascent lets grow: {mix}"
+            text = (
+                "its density matrix has zero eigenvalues whose eigenvectors the Hamiltonian turns, so steepest ascent "
+            )
+            text += f"would amplify the error of a step. {mix}"
             return text if any(turned) else ""
         grows = [self._equilibrium_population(x[i], kernels[i]) > self._zero_eigenvalue_limit for i in use]
         if not any(grows):
             return ""
         first = grows.index(True)
-        floor = ", or give the system entropy=lt.VonNeumann(floor=1e-12), which leaves this eigenvalue at zero"
+        floor = ", or give the system entropy=lt.VonNeumann(floor=1e-12), which keeps this eigenvalue at zero"
         return (
             f"its density matrix has the eigenvalue {np.linalg.eigvalsh(rho[use[first]])[0]:.3g}, where the gradient "
-            f"of the entropy is infinite: {mix}{'' if turned[first] else floor}"
+            f"of the entropy is infinite. {mix}{'' if turned[first] else floor}"
         )
 
     def _is_kernel_rotated(self, rho: np.ndarray, kernel: np.ndarray) -> bool:
@@ -390,10 +392,12 @@ class QuantumSystem(System):
         if not grows.size:
             return ""
         eigenvalue = np.linalg.eigvalsh(rho[use[grows[0]]])[0]
-        otherwise = ", or take lt.MetriplecticRungeKutta, whose stages are without it" if has_generator(self) else ""
+        otherwise = (
+            ", or lt.MetriplecticRungeKutta, which does not evaluate this gradient" if has_generator(self) else ""
+        )
         return (
-            f"its density matrix has the eigenvalue {eigenvalue:.3g}, which jumps make larger, where the gradient of "
-            f"the entropy is infinite: mix it, as in q.state(rho, mixed=1e-6){otherwise}"
+            f"its density matrix has the eigenvalue {eigenvalue:.3g}, where the gradient of the entropy is infinite, "
+            f"and jumps move the state off it. Use system.state(rho, mixed=1e-6){otherwise}"
         )
 
     def _jump_rates(self, x: np.ndarray, kernels: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
