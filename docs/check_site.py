@@ -319,7 +319,10 @@ def check_sources(docs: Path) -> list[str]:
     """What the pages say in passing, and the numbers that they share."""
     pages = check_text.sources(docs)
     checks = (check_text.untrue_spans, check_text.differing_numbers, check_text.lost_paragraphs, check_text.wide_code)
-    return [problem for check in checks for problem in check(pages)]
+    examples = {
+        str(file.relative_to(docs.parent)): file.read_text() for file in docs.parent.glob("examples/*/plot_*.py")
+    }
+    return [problem for check in checks for problem in check(pages)] + list(check_text.wide_examples(examples))
 
 
 def take_pictures(chromium: Browser, html: Path) -> None:

@@ -76,6 +76,15 @@ def wide_code(pages: Mapping[str, str]) -> Iterator[str]:
                 yield f"{name}: code has {len(line)} columns, at most {MAX_COLUMNS} are shown: {line[:80]}"
 
 
+def wide_examples(examples: Mapping[str, str]) -> Iterator[str]:
+    """Yield the lines of code of examples of the gallery that are wider than a page; comments are prose there."""
+    for name, text in examples.items():
+        code = text.split('"""', 2)[-1]
+        for line in code.splitlines():
+            if len(line) > MAX_COLUMNS and not line.startswith("#"):
+                yield f"{name}: code has {len(line)} columns, at most {MAX_COLUMNS} are shown: {line[:80]}"
+
+
 def untrue_spans(pages: Mapping[str, str]) -> Iterator[str]:
     """Python in code font that does not fit the packages; the pages are Markdown."""
     sys.path.append(str(EXTENSIONS))

@@ -23,7 +23,7 @@ axis = (0.0, 0.0, 1.0)
 
 
 def satellite(platform_rate, rotor_rate, torque=None):
-    """Return the satellite with friction in its parts; a rate r damps the nutation by r L lambda."""
+    """Return the satellite; friction of a rate r damps the nutation by r L lambda."""
     return lt.models.dual_spin(
         (transverse, transverse, axial),
         axis,

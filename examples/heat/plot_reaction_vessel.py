@@ -47,7 +47,8 @@ for T in (0.4, 0.6, 0.9, 1.3, 2.0):
     K = float(gas.equilibrium_constant(end, nu))
     found.append((end, C / (A * B)))
     print(
-        f"from T = {T}: ends at {end:.4f}, n_C / (n_A n_B) = {C / (A * B):.4g}, K(T) = {K:.4g}, "
+        f"from T = {T}: ends at {end:.4f}, n_C / (n_A n_B) = {C / (A * B):.4g}, "
+        f"K(T) = {K:.4g}, "
         f"relative difference {abs(C / (A * B) / K - 1.0):.0e}; "
         f"energy to {np.ptp(run.energy) / abs(run.energy[0]):.0e}, "
         f"least rise of the entropy {np.diff(run.entropy).min():.0e}"

@@ -51,6 +51,19 @@ def test_code_wider_than_a_page_is_found(check_text, language):
     assert "89 columns" in problem
 
 
+def test_code_of_an_example_wider_than_a_page_is_found(check_text):
+    example = f'"""\nTitle\n=====\n\n{100 * "w"}\n"""\n\n# {100 * "w"}\n{{}}\n'
+    assert list(check_text.wide_examples({"plot.py": example.format(check_text.MAX_COLUMNS * "x")})) == []
+    (problem,) = check_text.wide_examples({"plot.py": example.format((check_text.MAX_COLUMNS + 1) * "x")})
+    assert "89 columns" in problem
+
+
+def test_the_code_of_the_examples_fits_a_page(check_text):
+    examples = {file.name: file.read_text() for file in DOCS.parent.glob("examples/*/plot_*.py")}
+    assert len(examples) > 30
+    assert list(check_text.wide_examples(examples)) == []
+
+
 def test_the_check_of_the_sources_finds_each_kind(import_from_docs, tmp_path):
     check_site = import_from_docs("check_site")
     page = tmp_path / "page.md"
