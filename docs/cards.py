@@ -24,6 +24,9 @@ FIGURES = {
 }
 """Pages, and which of their figures the card shows."""
 
+CARD_STYLE = {"font.size": 14, "legend.fontsize": 12, "lines.linewidth": 2.2}
+"""Text and lines that can be read in a card, which is smaller than the figure of the page."""
+
 SIZE = (560, 320)
 """Width and height of a card (pixels); a figure is fitted into it on white."""
 
@@ -33,6 +36,7 @@ def draw_card(page: str, index: int) -> Path:
     sys.path.append(str(DOCS / "_ext"))
     from executed import run_page
 
+    matplotlib.rcParams.update(CARD_STYLE)
     results = run_page(page, (DOCS / f"{page}.md").read_text())
     if results.failures:
         raise RuntimeError(f"{page}: {'; '.join(results.failures)}")

@@ -1,7 +1,8 @@
 """Walks the built site in a headless Chromium without a network: ``make docs-check``.
 
 It looks for console errors, files that do not load, links and anchors that lead nowhere, formulas and tables that stay
-raw, pages wider than their screen, tables and code that are clipped, and words that the search does not find. In the
+raw, printed numbers that are not rounded, pages wider than their screen, tables and code that are clipped, text that a
+picture squeezes, and words that the search does not find. In the
 sources it looks for code in passing that is not true, numbers that differ from page to page, paragraphs that begin
 within a line, and code wider than a page. Pictures of pages, at two widths, light and dark, go to
 ``docs/_build/screenshots``.
@@ -52,12 +53,25 @@ WORDS = {
     "density matrix": "density",
     "nutation": "nutation",
     "thermostat": "bath",
+    "license": "licence",
+    "citation": "citation",
+    "roadmap": "roadmap",
+    "LLG": "LLG",
+    "micromagnetics": "magnet",
+    "master equation": "master equation",
+    "float32": "install",
+    "Toda": "toda",
+    "reaction wheel": "spacecraft",
 }
 """What a reader looks for, and what a title or an excerpt of the answer holds."""
 
-CLASS_MEMBERS = (
+PICTURED_PAGES = (
     "index",
     "start/index",
+    "start/install",
+    "start/adopt",
+    "start/spacecraft",
+    "start/magnets",
     "tutorials/index",
     "tutorials/first_run",
     "howto/index",
@@ -67,9 +81,12 @@ CLASS_MEMBERS = (
     "reference/api",
     "reference/benchmarks",
     "reference/generated/liethermo.integrate",
+    "reference/generated/liethermo.LiePoissonSystem",
     "reference/generated/manifolds.LieAlgebra",
     "gallery/index",
 )
+"""Pages of which screenshots are taken."""
+
 WIDTHS = (1280, 390)
 
 PROBE = """(() => {
@@ -101,6 +118,8 @@ PROBE = """(() => {
         if (["auto", "scroll"].includes(getComputedStyle(node).overflowX)) return false;
       return true;
     }).map((e) => e.textContent.trim().slice(0, 60)),
+    squeezed: all(".bd-article img").filter((e) => e.offsetParent && getComputedStyle(e).float !== "none"
+      && e.offsetWidth > document.documentElement.clientWidth / 2).map((e) => e.src),
     headerLines: lines,
     previous: !!document.querySelector(".prev-next-footer a, .prev-next-area a"),
   };
@@ -255,13 +274,14 @@ def check_pages(chromium: Browser, html: Path, match: str = "*") -> list[str]:
         wrong += [f"{name}: formula not typeset: {text}" for text in seen["raw"]]
         wrong += [f"{name}: formula in error: {text}" for text in seen["broken"]]
         wrong += [f"{name}: clipped at 1280 pixels: {text}" for text in seen["clipped"]]
-        for check in (check_text.raw_tables, check_text.raw_headings):
+        for check in (check_text.raw_tables, check_text.raw_headings, check_text.unrounded_output):
             wrong += [f"{name}: {text}" for text in check(page.read_text())]
         if seen["headerLines"] > 1:
             wrong.append(f"{name}: the header takes {seen['headerLines']} lines")
         chromium.resize(390)
         narrow = chromium.evaluate(PROBE)
         wrong += [f"{name}: cut off at 390 pixels: {text}" for text in narrow["cut"][:3]]
+        wrong += [f"{name}: text squeezed beside a picture at 390 pixels: {source}" for source in narrow["squeezed"]]
         if narrow["wide"] > 0:
             wrong.append(f"{name}: {narrow['wide']} pixels wider than 390: {narrow['culprits']}")
     for name, link in sorted(set(links)):
@@ -299,11 +319,14 @@ def check_sources(docs: Path) -> list[str]:
     """What the pages say in passing, and the numbers that they share."""
     pages = check_text.sources(docs)
     checks = (check_text.untrue_spans, check_text.differing_numbers, check_text.lost_paragraphs, check_text.wide_code)
-    return [problem for check in checks for problem in check(pages)]
+    examples = {
+        str(file.relative_to(docs.parent)): file.read_text() for file in docs.parent.glob("examples/*/plot_*.py")
+    }
+    return [problem for check in checks for problem in check(pages)] + list(check_text.wide_examples(examples))
 
 
 def take_pictures(chromium: Browser, html: Path) -> None:
-    for name, width in itertools.product(CLASS_MEMBERS, WIDTHS):
+    for name, width in itertools.product(PICTURED_PAGES, WIDTHS):
         chromium.resize(width)
         chromium.open((html / f"{name}.html").as_uri())
         for theme in ("light", "dark"):

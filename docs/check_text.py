@@ -24,6 +24,12 @@ CODE_ELEMENT = re.compile(r"<(code|pre)\b.*?</\1>", re.DOTALL)
 LOST_PARAGRAPH = re.compile(r"(?<=[.:;)`])  +(?=\S)|(?<=\S) ##+ \w")
 """Two blanks where a paragraph began, or a heading within a line."""
 
+OUTPUT = re.compile(r'<div class="[^"]*(?:\boutput\b|script-out)[^"]*">.*?<pre>(.*?)</pre>', re.DOTALL)
+"""What a block of code prints."""
+
+MAX_DECIMALS = 14
+"""Decimals of a printed number: reference values have 14, and a number that nobody has rounded 15 or more."""
+
 MAX_COLUMNS = 88
 """Columns of a line of code that a page of the site shows without a scroll bar."""
 
@@ -47,6 +53,13 @@ def raw_headings(page: str) -> Iterator[str]:
             yield f"a heading is shown as raw text: {' '.join(text.split())[:80]}"
 
 
+def unrounded_output(page: str) -> Iterator[str]:
+    """Yield the numbers that a block of code on a built page prints with more digits than a reader can use."""
+    for output in OUTPUT.findall(page):
+        for number in re.findall(rf"\d+\.\d{{{MAX_DECIMALS + 1},}}(?:e[+-]?\d+)?", TAG.sub("", output)):
+            yield f"a printed number has more than {MAX_DECIMALS} decimals: {number}"
+
+
 def lost_paragraphs(pages: Mapping[str, str]) -> Iterator[str]:
     """Yield the lines of Markdown pages in which a paragraph or a heading begins within the line."""
     for name, text in pages.items():
@@ -60,6 +73,15 @@ def wide_code(pages: Mapping[str, str]) -> Iterator[str]:
     for name, text in pages.items():
         for line in "\n".join(LISTING.findall(text)).splitlines():
             if len(line) > MAX_COLUMNS:
+                yield f"{name}: code has {len(line)} columns, at most {MAX_COLUMNS} are shown: {line[:80]}"
+
+
+def wide_examples(examples: Mapping[str, str]) -> Iterator[str]:
+    """Yield the lines of code of examples of the gallery that are wider than a page; comments are prose there."""
+    for name, text in examples.items():
+        code = text.split('"""', 2)[-1]
+        for line in code.splitlines():
+            if len(line) > MAX_COLUMNS and not line.startswith("#"):
                 yield f"{name}: code has {len(line)} columns, at most {MAX_COLUMNS} are shown: {line[:80]}"
 
 

@@ -31,6 +31,10 @@ for package in (liethermo, manifolds):  # what is imported on demand as an attri
         if inspect.ismodule(value := getattr(package, name)):
             sys.modules.setdefault(f"{package.__name__}.{name}", value)
 
+from manifolds._class_members import CLASS_MEMBERS, HELP_MEMBERS  # noqa: E402
+
+HELP_MEMBERS.update(CLASS_MEMBERS)  # autodoc finds members by dir(), and a page shows more of them than help()
+
 import api_members  # noqa: E402
 import beside  # noqa: E402
 from facts import write_facts  # noqa: E402

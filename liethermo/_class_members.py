@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
-from manifolds._class_members import CLASS_MEMBERS, LIBRARY_PACKAGES
+from manifolds._class_members import LIBRARY_PACKAGES, add_class_members
 
 LIBRARY_PACKAGES.add("liethermo")
-CLASS_MEMBERS.update(
-    (name, tuple(members.split()))
-    for name, members in {
+add_class_members(
+    {
         # Systems
-        "System": "state vector_field entropy_production temperatures casimirs first_integrals check",
-        "LiePoissonSystem": "momentum_of_velocity",
+        "System": "state vector_field entropy_production casimirs / temperatures first_integrals check",
+        "LiePoissonSystem": "/ momentum_of_velocity",
         "EulerPoincareSystem": "velocity momentum",
-        "SimpleClosedSystem": "legendre momentum mechanical_energy",
-        "LedgerSystem": "temperature friction_force external_force heating",
-        "EulerPoincareClosedSystem": "momentum momenta",
+        "SimpleClosedSystem": "/ legendre momentum mechanical_energy",
+        "LedgerSystem": "temperature friction_force / external_force heating",
+        "EulerPoincareClosedSystem": "momentum / momenta",
         "VelocityContactSystem": "legendre",
         "Herglotz": "hamiltonian_system",
         "ThermodynamicHerglotz": "hamiltonian_system",
         "EvolutionSystem": "temperature",
-        "ComposedSystem": "split entropies numbers_of_particles chemical_potentials",
+        "ComposedSystem": "split entropies / numbers_of_particles chemical_potentials",
         "SpinSystem": "spins largest_step",
         "QuantumSystem": """
-            density reduced expectation bloch steady_state heat_currents power adiabatic_parameter coupled
+            density expectation / heat_currents reduced steady_state bloch power adiabatic_parameter coupled
             """,
-        "TreeSystem": "mass_matrix joint_rates",
+        "Tree": "add system names base / from_urdf from_mjcf",
+        "TreeSystem": "/ mass_matrix joint_rates",
         "JointedBodies": "angular_velocity centre_of_mass base_position",
         # Dissipations
         "Dissipation": "energy_law entropy_law preserves_casimirs",
@@ -41,12 +41,15 @@ CLASS_MEMBERS.update(
         "TimeDependent": "break_times",
         # Methods
         "OneStepMethod": "explicit evaluations_per_iteration check preserves_function",
-        "VariationalIntegrator": "verlet midpoint symmetrised discrete_system curve energies",
+        "VariationalIntegrator": "verlet midpoint symmetrised / discrete_system curve energies",
         "LieVariational": "attitudes",
         # Results
-        "Solution": "audit energy_balance save to_xarray from_file",
-        "AuditableResult": "joints velocities",
-        "Ensemble": "ok audit save to_xarray from_file event_time message member_solution member_status member_stats",
+        "Training": "estimate confidence_interval with_estimates problems",
+        "Solution": "audit energy_balance save / to_xarray from_file",
+        "AuditableResult": "velocities / joints",
+        "Ensemble": """
+            ok audit save / message event_time to_xarray from_file member_solution member_status member_stats
+            """,
         "Fluctuations": "of check increments",
-    }.items()
+    }
 )

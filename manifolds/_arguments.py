@@ -13,9 +13,9 @@ from .errors import ParameterError, SizeError
 def checked_size(value: int, minimum: int, name: str, label: str = "n") -> int:
     """Return ``value`` as an int, after checking that it is an integer and at least ``minimum``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise ParameterError(f"{name}: {label} must be an integer, not {value!r}")
+        raise ParameterError(f"{name}: {label} must be an integer, got {value!r}")
     if value < minimum:
-        raise ParameterError(f"{name}: {label} must be at least {minimum}, not {value}")
+        raise ParameterError(f"{name}: {label} must be at least {minimum}, got {value}")
     return int(value)
 
 
@@ -41,7 +41,7 @@ def checked_names(names, dim: int) -> tuple[str, ...]:
     labels = (names,) if isinstance(names, str) else tuple(names)
     are_identifiers = all(isinstance(name, str) and name.isidentifier() for name in labels)
     if not are_identifiers or len(labels) != dim or len(set(labels)) != dim:
-        raise ParameterError(f"{dim} basis elements need {dim} different names such as 'Jx', not {labels!r}")
+        raise ParameterError(f"{dim} basis elements need {dim} different names such as 'Jx', got {labels!r}")
     return labels
 
 

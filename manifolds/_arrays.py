@@ -20,7 +20,7 @@ def real_components(x, dim: int, label: str) -> jax.Array:
     """Return ``x`` as a real array of doubles, after checking that its last axis has length ``dim``."""
     array = jnp.asarray(numeric_array(x, label))
     if jnp.issubdtype(array.dtype, jnp.complexfloating):
-        raise ComponentError(f"{label} must be real, not {array.dtype}: take its real part if that is meant")
+        raise ComponentError(f"{label} must be real, got {array.dtype}. Take its real part if that is meant")
     if array.ndim == 0 or array.shape[-1] != dim:
         raise ShapeError(f"{label} must have last axis {dim}, but its shape is {array.shape}")
     return array.astype(jnp.float64)

@@ -1,7 +1,8 @@
 """The members of classes that users call: what ``help()`` and the reference show.
 
-A class shows the members that :data:`CLASS_MEMBERS` names for it and for its base classes. A class that has no entry,
-and no base class with one, shows every public member. An enumeration shows its members.
+The reference shows the members of a class that :data:`CLASS_MEMBERS` names for it and for its base classes; ``help()``
+lists those that :data:`HELP_MEMBERS` names, which a user calls first, so that it fits on two screens. A class that has
+no entry, and no base class with one, shows every public member. An enumeration shows its members.
 """
 
 from __future__ import annotations
@@ -9,17 +10,31 @@ from __future__ import annotations
 from abc import ABCMeta
 from enum import EnumType
 
-CLASS_MEMBERS: dict[str, tuple[str, ...]] = {
-    name: tuple(members.split())
-    for name, members in {
+CLASS_MEMBERS: dict[str, tuple[str, ...]] = {}
+"""Members that users call, by the name of the class that defines or first needs them."""
+
+HELP_MEMBERS: dict[str, tuple[str, ...]] = {}
+"""Members that ``help()`` of a class lists."""
+
+
+def add_class_members(members: dict[str, str]) -> None:
+    """Add the members of classes that users call, as names divided by blanks; ``help()`` lists those before a slash."""
+    for owner, names in members.items():
+        HELP_MEMBERS[owner] = tuple(names.partition("/")[0].split())
+        CLASS_MEMBERS[owner] = tuple(names.replace("/", " ").split())
+
+
+add_class_members(
+    {
         "Space": """
-            point random belongs project residual random_tangent project_tangent inner norm flat sharp exp log distance
-            squared_distance midpoint transport frame coordinates from_coordinates to_vector from_vector
+            point random belongs project inner exp log distance
+            / residual random_tangent project_tangent norm flat sharp squared_distance midpoint transport frame
+            coordinates from_coordinates to_vector from_vector
             """,
         "Flag": "projectors",
         "Grassmann": "subspace",
-        "GroupSpace": "velocity from_velocity",
-        "LevelSet": "geodesic",
+        "GroupSpace": "/ velocity from_velocity",
+        "LevelSet": "/ geodesic",
         "Product": "split join",
         "TangentBundle": "tangential_part",
         "PoissonStructure": "tensor sharp bracket hamiltonian_vector_field jacobi_residual rank",
@@ -27,40 +42,40 @@ CLASS_MEMBERS: dict[str, tuple[str, ...]] = {
         "ExtendedPhaseSpace": "state_indices particle_indices",
         "Spins": "spins",
         "ContactStructure": """
-            form differential volume flat sharp reeb horizontal bivector cartan_bracket jacobi_bracket
-            evolution_vector_field hamiltonian_vector_field
+            form flat sharp reeb jacobi_bracket evolution_vector_field hamiltonian_vector_field
+            / differential volume horizontal bivector cartan_bracket
             """,
-        "SplitContact": "liouville cosymplectic_bracket liouville_bracket",
+        "SplitContact": "/ liouville cosymplectic_bracket liouville_bracket",
         "LagrangianContact": "momentum rates legendre hessian energy",
         "LieAlgebra": """
-            from_brackets from_structure_constants from_matrices bracket ad ad_star hat vee casimirs casimir_count
-            killing_form killing_signature killing_inner_product cartan_involution is_abelian is_semisimple is_solvable
-            is_nilpotent is_unimodular is_compact_type derived_series lower_central_series isomorphism_type
-            change_of_basis with_basis_names with_invariants poisson_tensor
+            from_brackets bracket ad ad_star hat vee casimirs
+            / killing_form is_semisimple from_structure_constants from_matrices casimir_count killing_signature
+            killing_inner_product cartan_involution is_abelian is_solvable is_nilpotent is_unimodular is_compact_type
+            derived_series lower_central_series isomorphism_type change_of_basis with_basis_names with_invariants
+            poisson_tensor
             """,
         "StructureMethods": """
-            centre derived_ideals lower_central_ideals derivations radical nilradical levi_decomposition index
+            / centre derived_ideals lower_central_ideals derivations radical nilradical levi_decomposition index
             orbit_dimension
             """,
         "DirectSum": "split",
         "MagneticExtension": "halves",
         "MatrixAlgebra": "dual_matrix from_dual_matrix",
         "MatrixGroup": """
-            from_equations compose inverse identity belongs random exp log cayley inverse_cayley Ad Ad_star
+            from_equations compose identity exp log Ad / inverse Ad_star belongs random cayley inverse_cayley
             """,
-    }.items()
-}
-"""Members that users call, by the name of the class that defines or first needs them; other packages add theirs."""
+    }
+)
 
 
 def listed_names(cls: type) -> list[str]:
-    """Return the public names of a class that users call, in alphabetical order, without those of its base classes."""
+    """Return the names of a class that ``help()`` lists, in alphabetical order."""
     names, has_entry = dict[str, None](), False
     for base in cls.__mro__:
         package = base.__module__.partition(".")[0]
         if package in LIBRARY_PACKAGES and base.__qualname__ in CLASS_MEMBERS:
             has_entry = True
-            names |= dict.fromkeys(CLASS_MEMBERS[base.__qualname__])
+            names |= dict.fromkeys(HELP_MEMBERS[base.__qualname__])
         elif package not in (*LIBRARY_PACKAGES, "equinox", "builtins", "collections"):
             names |= dict.fromkeys(name for name in vars(base) if not name.startswith("_"))
     if not has_entry:

@@ -53,8 +53,8 @@ def text_table(rows: Iterable[TableRow], headings: tuple[str, str, str], footer:
     lines = [f"{headings[0]:<{width}}  {headings[1]:>10}  {headings[2]:>9}"]
     for row in rows:
         *name_lines, name = wrap_lines(row.name, width, "  ")
-        limit_text = " " * 9 if row.allowed is None or row.passed is None else f"{row.allowed:9.1e}"
-        line = f"{name:<{width}}  {row.value:10.2e}  {limit_text}  {VERDICT_TEXTS[row.passed]:<5}"
+        value_text, limit_text = value_and_limit(row)
+        line = f"{name:<{width}}  {value_text:>10}  {limit_text:>9}  {VERDICT_TEXTS[row.passed]:<5}"
         one_line = f"{line} {row.note}".rstrip()
         fits_on_page = len(one_line) <= PAGE_WIDTH
         lines += [
@@ -63,6 +63,14 @@ def text_table(rows: Iterable[TableRow], headings: tuple[str, str, str], footer:
             *([] if fits_on_page else wrap_lines(f"    {row.note}", PAGE_WIDTH, "    ")),
         ]
     return "\n".join([*lines, *wrap_lines(footer, PAGE_WIDTH)])
+
+
+def value_and_limit(row: TableRow) -> tuple[str, str]:
+    """Return the texts of the measured value and of its limit; counts are whole numbers."""
+    value_text = str(row.value) if isinstance(row.value, int) else f"{row.value:.2e}"
+    if row.allowed is None or row.passed is None:
+        return value_text, ""
+    return value_text, str(row.allowed) if isinstance(row.allowed, int) else f"{row.allowed:.1e}"
 
 
 def wrap_lines(text: str, width: int = PAGE_WIDTH, hang: str = "") -> list[str]:
@@ -79,8 +87,7 @@ def html_table(rows: Iterable[TableRow], headings: tuple[str, str, str], footer:
     cells = [
         (
             row.name,
-            f"{row.value:.2e}",
-            "" if row.allowed is None or row.passed is None else f"{row.allowed:.1e}",
+            *value_and_limit(row),
             VERDICT_TEXTS[row.passed],
             row.note,
         )

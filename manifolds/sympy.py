@@ -46,7 +46,7 @@ def expression(polynomial: Polynomial | Formula, variables: Sequence[sympy.Symbo
     """
     generators = symbols(polynomial.dim, polynomial.names) if variables is None else tuple(variables)
     if len(generators) != polynomial.dim:
-        raise ShapeError(f"a polynomial in {polynomial.dim} variables needs as many symbols, not {len(generators)}")
+        raise ShapeError(f"a polynomial in {polynomial.dim} variables needs as many symbols, got {len(generators)}")
     if isinstance(polynomial, Formula):
         meanings = dict(zip(polynomial.names, generators, strict=True)) | {"abs": sympy.Abs}
         return sympy.sympify(polynomial.text, locals=meanings)
@@ -73,7 +73,7 @@ def polynomial(expression: Any, variables: Sequence[sympy.Symbol]) -> Polynomial
         if not set(powers_of) <= {*variables, sympy.S.One} or not all(
             e.is_Integer and e >= 0 for e in powers_of.values()
         ):
-            raise ComponentError(f"{expression} is not a polynomial in {', '.join(map(str, variables))}: see {term}")
+            raise ComponentError(f"{expression} is not a polynomial in {', '.join(map(str, variables))}. See {term}")
         power = tuple(int(powers_of.get(x, 0)) for x in variables)
         terms[power] = terms.get(power, 0) + number
     powers = np.array(list(terms), dtype=np.int64).reshape(-1, len(variables))

@@ -317,7 +317,7 @@ REFUSALS = {
     "nan": ([MODEL, RUN.replace("1.0,", "nan,")], ["run.initial[1] = NaN: must be a finite number"]),
     "shape": (
         [MODEL, RUN.replace("1.0, ", "")],
-        ["run.initial = [0.001, 0.001]: a state of this system has shape (3,)"],
+        ["run.initial = [0.001, 0.001]: a state of this system must have shape (3,)"],
     ),
     "step": ([MODEL, RUN.replace("0.1", "-0.1")], ["run.step = -0.1: must be greater than 0"]),
     "text": ([MODEL, RUN.replace("0.1", '"0.1"')], ['run.step = "0.1": must be a valid number']),

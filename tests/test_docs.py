@@ -142,6 +142,8 @@ def test_a_name_that_does_not_exist_is_found(code_links):
     assert code_links.resolve("LieAlgebra") == "manifolds.LieAlgebra"
     assert code_links.resolve("step") is None
     assert code_links.resolve("u") is None  # a tangent vector
+    assert code_links.resolve("learn") is None  # an extra
+    assert code_links.resolve("lt.learn") == "liethermo.learn"
     assert code_links.resolve("mf.u") == code_links.resolve("u(n)") == "manifolds.u"
     with pytest.raises(AttributeError, match="integrat"):
         code_links.resolve("lt.integrat")

@@ -16,6 +16,7 @@ yaml = pytest.importorskip("yaml")
 ROOT = Path(__file__).parents[1]
 RULES = {path.stem: yaml.safe_load(path.read_text()) for path in sorted((ROOT / "docs/vale/liethermo").glob("*.yml"))}
 PAGES = [*ROOT.glob("*.md"), *(page for page in ROOT.glob("docs/**/*.md") if "_build" not in page.parts)]
+EXAMPLES = [*ROOT.glob("examples/*/plot_*.py")]
 MODULES = [*ROOT.glob("liethermo/**/*.py"), *ROOT.glob("manifolds/**/*.py")]
 
 
@@ -33,6 +34,19 @@ def paragraphs_of_module(text: str) -> Iterator[str]:
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
             blocks = re.split(r"\n\s*\n|\n\s*-{3,}\s*\n|\n(?=\s*\S+(?:, \S+)* : )", node.value.value)
             yield from (block for block in blocks if "====" not in block and ">>> " not in block)  # no tables, no code
+
+
+def paragraphs_of_example(text: str) -> Iterator[str]:
+    """Yield the introduction and the comments of an example of the gallery, by paragraphs and entries of lists."""
+    comments = re.findall(r"(?:^#(?: .*)?\n)+", text, re.MULTILINE)
+    for part in (
+        ast.get_docstring(ast.parse(text)) or "",
+        *(re.sub(r"^# ?", "", c, flags=re.MULTILINE) for c in comments),
+    ):
+        prose = re.sub(r":math:`.*?`", "x", part, flags=re.DOTALL)
+        yield from (
+            b for b in re.split(r"\n\s*\n|\n(?=- )", prose) if "====" not in b and not b.startswith((".. ", " "))
+        )
 
 
 def messages_of_module(text: str) -> Iterator[str]:
@@ -56,7 +70,11 @@ KINDS = {
     "pages": (PAGES, paragraphs_of_page),
     "docstrings": (MODULES, paragraphs_of_module),
     "messages": (MODULES, messages_of_module),
+    "examples": (EXAMPLES, paragraphs_of_example),
 }
+
+UNCLEAR_MESSAGE = re.compile(r"\b(is|are|has|have|must)\b[^.;]*, not x|[:;] (give|take|use|set|leave|write|remove) ")
+"""A message that does not say "must be Y, got Z", or whose cure is no sentence of its own."""
 
 
 def faults(paragraph: str) -> Iterator[str]:
@@ -78,9 +96,22 @@ def faults(paragraph: str) -> Iterator[str]:
 def test_prose_follows_the_rules(kind):
     files, paragraphs = KINDS[kind]
     read = [(path, paragraph) for path in files for paragraph in paragraphs(path.read_text())]
-    assert len(read) > 400
+    assert len(read) > 150
     faults_found = [f"{path.relative_to(ROOT)}: {fault}" for path, paragraph in read for fault in faults(paragraph)]
     assert not faults_found, "\n".join(faults_found)
+
+
+def test_messages_say_what_must_be_what_was_given_and_the_cure():
+    messages = [(path, message) for path in MODULES for message in messages_of_module(path.read_text())]
+    assert len(messages) > 1000
+    unclear = [f"{path.relative_to(ROOT)}: {message}" for path, message in messages if UNCLEAR_MESSAGE.search(message)]
+    assert not unclear, "\n".join(unclear)
+
+
+@pytest.mark.parametrize("message", ["a rate must be >= 0, not x", "x depends on time: take system.at_time(t)"])
+def test_an_unclear_message_is_found(message):
+    assert UNCLEAR_MESSAGE.search(message)
+    assert not UNCLEAR_MESSAGE.search("a rate must be >= 0, got x. Use its absolute value")
 
 
 MANNER = (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import inspect
 import re
 from typing import Any
 
@@ -42,6 +43,8 @@ def resolve(text: str) -> str | None:
             found: Any = package
             for part in rest.split("."):
                 found = getattr(found, part)
+            if not prefix and inspect.ismodule(found):  # `learn` is an extra too
+                return None
             return f"{package.__name__}.{rest}"
     return None
 

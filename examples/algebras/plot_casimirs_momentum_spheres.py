@@ -45,7 +45,7 @@ surfaces = [
 ]
 
 # %%
-# The library computes the Casimirs, and every motion keeps its Casimir to rounding. The motions are the lines of
+# The library computes the Casimirs, and every motion conserves its Casimir to rounding. The motions are the lines of
 # constant energy on the surface. Dark lines have little energy, and lines on the far side are pale.
 
 

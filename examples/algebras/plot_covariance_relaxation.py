@@ -5,7 +5,7 @@ Where does a covariance of given energy have most entropy?
 A Gaussian cloud with the covariance P, a positive definite matrix, has the entropy log det P / 2, and in a harmonic
 trap with the stiffness A the energy tr(A P) / 2. At a given energy the entropy is largest if P is a multiple of the
 inverse of A. This is equipartition. The gradient flow of the entropy at constant energy, in the affine-invariant metric
-of the positive definite matrices, leads there. It is a metriplectic system without conservative motion.
+of the positive definite matrices, leads there. This flow is a metriplectic system without conservative motion.
 """
 
 import jax.numpy as jnp
@@ -43,7 +43,7 @@ limit = np.linalg.inv(stiffness) * 2 * solution.energy[0] / 3
 print(f"distance to equipartition: {float(system.space.distance(P[-1], limit)):.1e}")
 
 # %%
-# The cloud as an ellipsoid, its axes the standard deviations.
+# The figure shows the cloud as an ellipsoid whose axes are the standard deviations.
 
 figure = plt.figure(figsize=(10, 5.5), layout="constrained")
 u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 60), np.linspace(0, np.pi, 30))

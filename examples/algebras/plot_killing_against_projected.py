@@ -2,8 +2,8 @@ r"""
 Is Killing dissipation the same as the projected metric?
 ========================================================
 
-Both keep the energy and raise a Casimir. On so(3) they are the same up to a factor. On larger algebras they differ, and
-may even have different states of rest.
+Both dissipations conserve the energy and raise a Casimir. On so(3) they are equal up to a factor. On larger algebras
+they differ and may even have different states of rest.
 """
 
 import matplotlib.pyplot as plt

@@ -2,8 +2,8 @@
 How do I run a system on a Lie algebra of my own?
 =================================================
 
-The oscillator algebra is not in the catalogue. It has a rotation J, a Heisenberg pair Q and P that J rotates, and a
-central element Z: [J, Q] = P, [J, P] = -Q, [Q, P] = Z. Three lines define it.
+The oscillator algebra is not in the catalogue. Its basis consists of a rotation J, a Heisenberg pair Q and P that J
+rotates, and a central element Z: [J, Q] = P, [J, P] = -Q, [Q, P] = Z. Three lines define it.
 """
 
 import matplotlib.pyplot as plt
@@ -23,7 +23,7 @@ print(
 )
 
 # %%
-# The library checks the axioms, and exactly for rational constants. In this wrong version Z is not central:
+# The library checks the axioms, exactly if the constants are rational. In this wrong version Z is not central:
 
 C[J, Z, Z] = 1
 try:

@@ -6,8 +6,8 @@ A long boom with a tip mass points to the earth, since gravity pulls more strong
 with the mean motion n the pitch :math:`\theta` of a rigid satellite obeys :math:`\theta'' = -\tfrac32 \kappa n^2 \sin
 2\theta` with :math:`\kappa = (I_y - I_x) / I_z` [Hughes, *Spacecraft Attitude Dynamics*, 1986, chapter 9]. It librates
 at the frequency :math:`\sqrt{3 \kappa}\, n` for small angles, and it tumbles where the pitch rate exceeds
-:math:`\sqrt{3 \kappa}\, n` on the vertical. A hinge with a damper between satellite and boom takes the energy of the
-tumbling away, until the satellite is caught and the pitch decays.
+:math:`\sqrt{3 \kappa}\, n` on the vertical. A hinge with a damper between satellite and boom removes the energy of the
+tumbling, until the satellite is caught and the pitch decays.
 """
 
 import matplotlib.pyplot as plt
@@ -21,7 +21,7 @@ orbit = lt.torques.Orbit(mean_motion)  # at t = 0 the centre is along x
 
 
 def satellite(damping, stiffness):
-    """Return a bus with a boom along x on a hinge about the normal of the orbit; a damper heats a bath."""
+    """Return a bus with a boom along x on a hinge with a damper that heats a bath."""
     tree = lt.bodies.Tree()
     tree.add("bus", mass=100.0, inertia=(bus_inertia,) * 3)
     hinge = lt.bodies.Hinge((0, 0, 0), (0, 0, 1), stiffness=stiffness, damping=damping)
@@ -64,7 +64,8 @@ run = lt.integrate(
 )
 error = np.abs(pitch_of_boom(run) - 1e-3 * np.sin(frequency * run.t)).max()
 print(
-    f"libration at {frequency / mean_motion:.3f} n, off from the linear theory by {error:.1e} rad"
+    f"libration at {frequency / mean_motion:.3f} n, "
+    f"off from the linear theory by {error:.1e} rad"
 )
 assert error < 3e-6
 assert run.audit().passed
@@ -85,11 +86,13 @@ run = lt.integrate(
 pitch = np.degrees(pitch_of_boom(run))
 n_half_turns = np.round(pitch[-1] / 180.0)
 print(
-    f"turns before the capture: {n_half_turns / 2.0}, pitch at the end {pitch[-1] - 180.0 * n_half_turns:.2f} degrees"
+    f"turns before the capture: {n_half_turns / 2.0}, "
+    f"pitch at the end {pitch[-1] - 180.0 * n_half_turns:.2f} degrees"
 )
 print(f"heat of the damper: {1e3 * 280.0 * run.x[-1, -1]:.2f} mJ")
 print(
-    f"pitch in the last two orbits: {np.ptp(pitch[run.t > 48.0 * period]):.1f} degrees from end to end"
+    "pitch in the last two orbits: "
+    f"{np.ptp(pitch[run.t > 48.0 * period]):.1f} degrees from end to end"
 )
 assert run.audit().passed
 assert np.ptp(pitch[run.t > 48.0 * period]) < 10.0
@@ -103,5 +106,5 @@ figure.tight_layout()
 # What is not reproduced
 # ----------------------
 #
-# The frequency and the limit of the pitch rate are Hughes'. The satellite is none that has flown: the friction of a
+# The frequency and the limit of the pitch rate are Hughes'. The satellite is fictitious: the friction of a
 # hinge in orbit and the bending of a boom are not known well enough to compare a capture with a flight.

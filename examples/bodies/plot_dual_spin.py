@@ -23,7 +23,7 @@ axis = (0.0, 0.0, 1.0)
 
 
 def satellite(platform_rate, rotor_rate, torque=None):
-    """Return the satellite with friction in its parts; a rate r damps the nutation by r L lambda."""
+    """Return the satellite; friction of a rate r damps the nutation by r L lambda."""
     return lt.models.dual_spin(
         (transverse, transverse, axial),
         axis,
@@ -75,8 +75,8 @@ assert all(run.audit().passed for run in runs.values())
 # -----------------
 #
 # With the platform at rest, its friction at the rate a and that of the rotor at the rate b change the nutation at the
-# rate :math:`-L (a \lambda_p + b \lambda_r)`. The runs have this rate to a thousandth, and the nutation grows where
-# the condition says so.
+# rate :math:`-L (a \lambda_p + b \lambda_r)`. The runs reproduce this rate to a thousandth, and the nutation grows
+# where the condition predicts it.
 
 shares, measured = np.linspace(0.0, 2.0, 9), []
 rotor_speed = momentum / rotor  # rad/s, with the platform at rest
@@ -108,6 +108,6 @@ figure.tight_layout()
 # What is not reproduced
 # ----------------------
 #
-# The condition and its rates are Likins' own result, but the satellite is none that has flown: damping times in flight
+# The condition and its rates are Likins' own result, but the satellite is fictitious: damping times in flight
 # depend on the dissipation in tanks, bearings and dampers, and these powers are not published with the inertias. A
 # damper has a frequency of its own, too: friction that follows the motion at once, as here, has none.

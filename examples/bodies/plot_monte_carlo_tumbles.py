@@ -7,7 +7,7 @@ into a flat spin. The moments of inertia, the error of pointing at the separatio
 roughly, so the time of the fall is a distribution. The example runs 2,000 satellites and compares each with a closed
 form.
 
-The friction is not that of a named satellite: it was measured for none of this form. With weaker friction all times
+The friction is not that of a real satellite: no measurement exists for this shape. With weaker friction all times
 are longer by one factor, because the angle depends on the product of rate and time. :doc:`/tutorials/asteroid_wobble`
 compares a run with what was seen of Explorer 1.
 """
@@ -49,7 +49,7 @@ def satellite(p):
 
 
 def sideways_excess(x):
-    """Return a function of the momentum that is zero at 45 degrees between it and the long axis."""
+    """Return a function that is zero where momentum and long axis are at 45 degrees."""
     return x[0] ** 2 + x[1] ** 2 - x[2] ** 2
 
 
@@ -74,14 +74,16 @@ exact = -np.log(np.tan(cone)) / (
     rate * (1.0 / moments[:, 2] - 1.0 / moments[:, 0]) * L**2
 )
 print(
-    f"largest relative error of the 2,000 times: {np.abs(flights.event_time / exact - 1.0).max():.0e}"
+    "largest relative error of the 2,000 times: "
+    f"{np.abs(flights.event_time / exact - 1.0).max():.0e}"
 )
 assert np.abs(flights.event_time / exact - 1.0).max() < 1e-5
 
 minutes = flights.event_time / 60.0
 low, median, high = np.percentile(minutes, [5.0, 50.0, 95.0])
 print(
-    f"turned over after {median:.1f} minutes, from {low:.1f} to {high:.1f} in 90 of 100 cases"
+    f"turned over after {median:.1f} minutes, "
+    f"from {low:.1f} to {high:.1f} in 90 of 100 cases"
 )
 
 # %%

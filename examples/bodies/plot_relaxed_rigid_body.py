@@ -14,7 +14,7 @@ body = lt.models.rigid_body(inertia)
 solution = lt.integrate(body, [0.001, 1.0, 0.001], t_span=(0.0, 60.0), step=0.1)
 
 # %%
-# The scheme keeps both laws at every step, and the audit says so.
+# The scheme obeys both laws at every step, and the audit says so.
 
 print(solution.audit())
 

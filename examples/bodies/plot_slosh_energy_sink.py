@@ -75,7 +75,8 @@ roots = np.linalg.eigvals(np.linalg.solve(left, right))
 slowest = roots[np.argmax(roots.real)]
 period = 2.0 * np.pi / abs(slowest.imag)
 print(
-    f"linear theory: nutation period {period:.1f} s, damping time {-1.0 / slowest.real:.0f} s"
+    f"linear theory: nutation period {period:.1f} s, "
+    f"damping time {-1.0 / slowest.real:.0f} s"
 )
 
 # %%
@@ -93,7 +94,8 @@ damping_time = -1.0 / np.polyfit(solution.t[late], np.log(nutation[late]), 1)[0]
 print(f"the run:       damping time {damping_time:.0f} s")
 warmer = np.asarray(system.temperatures(solution.x))[-1, 0] - 290.0
 print(
-    f"the fuel is {warmer:.2e} K warmer, and the energy has changed by {np.ptp(solution.energy):.0e} J"
+    f"the fuel is {warmer:.2e} K warmer, "
+    f"and the energy has changed by {np.ptp(solution.energy):.0e} J"
 )
 assert abs(damping_time * -slowest.real - 1.0) < 0.02
 

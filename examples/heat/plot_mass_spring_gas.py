@@ -3,8 +3,8 @@ What becomes of the energy in a variational scheme?
 ===================================================
 
 A mass on a spring rubs in a room full of gas, and the gas gains the energy that the mass loses. The three variational
-schemes of Gay-Balmaz and Yoshimura discretise the variational principle of this system. None of them keeps the energy
-to rounding; these are the figures 5.2 to 5.25 of their paper: two cases, four frictions, :math:`10^5` steps of a
+schemes of Gay-Balmaz and Yoshimura discretise the variational principle of this system. None conserves the energy to
+rounding; these are the figures 5.2 to 5.25 of their paper: two cases, four frictions, :math:`10^5` steps of a
 millisecond.
 """
 
@@ -105,9 +105,9 @@ def draw(case, runs):
 # paper leaves out.
 #
 # The paper says that the error of scheme 1 decreases in time and that those of schemes 2 and 3 stay constant. Here the
-# error of scheme 1 decreases until the mass rests. That of scheme 2 is rounding without friction, and otherwise *grows*
-# with the heat to 1.5e-11 and stays there. That of scheme 3 oscillates up to 3.01e-11 and settles at the same value.
-# When the mass has come to rest, all three have the same error.
+# error of scheme 1 decreases until the mass rests. The error of scheme 2 is rounding without friction, and otherwise
+# *grows* with the heat to 1.5e-11 and stays there. The error of scheme 3 oscillates up to 3.01e-11 and settles at the
+# same value. When the mass has come to rest, all three have the same error.
 
 runs = study(1)
 draw(1, runs)

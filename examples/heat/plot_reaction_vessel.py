@@ -8,7 +8,7 @@ mixture warms the jacket of the vessel. The warmer it is, the less C there is in
 .. math::
    \frac{n_C}{n_A n_B} = K(T),
 
-has a constant that falls with the temperature. The system does not contain this law. It has an energy, an entropy, and
+has a constant that falls with the temperature. This law is not an input. The system has an energy, an entropy, and
 a reaction that acts as a friction between chemical potentials.
 """
 
@@ -34,7 +34,7 @@ def state(T, numbers):
 
 
 # %%
-# From mixtures of different temperatures, each with as many particles of A and B.
+# The runs start from mixtures of different temperatures, each with equally many particles of A and B.
 
 _, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.6), layout="constrained")
 found = []
@@ -47,8 +47,9 @@ for T in (0.4, 0.6, 0.9, 1.3, 2.0):
     K = float(gas.equilibrium_constant(end, nu))
     found.append((end, C / (A * B)))
     print(
-        f"from T = {T}: ends at {end:.4f}, n_C / (n_A n_B) = {C / (A * B):.12g}, K(T)"
-        f" = {K:.12g}; "
+        f"from T = {T}: ends at {end:.4f}, n_C / (n_A n_B) = {C / (A * B):.4g}, "
+        f"K(T) = {K:.4g}, "
+        f"relative difference {abs(C / (A * B) / K - 1.0):.0e}; "
         f"energy to {np.ptp(run.energy) / abs(run.energy[0]):.0e}, "
         f"least rise of the entropy {np.diff(run.entropy).min():.0e}"
     )

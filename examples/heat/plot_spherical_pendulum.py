@@ -63,8 +63,9 @@ reference = on_sphere(
 )
 
 # %%
-# The variational schemes keep the sphere to rounding, and the second law, but not the energy. The metriplectic methods
-# keep all three. The errors fall with the step according to the order of each method.
+# The points of the variational schemes stay on the sphere to rounding, and the entropy never falls, but the energy is
+# conserved only approximately. The metriplectic methods also conserve the energy to rounding. The errors fall with the
+# step according to the order of each method.
 
 methods = {
     "scheme 1": lt.VariationalIntegrator.verlet(),
@@ -88,7 +89,7 @@ for name, method in methods.items():
     )
 
 # %%
-# The path from above, the energies, and the errors.
+# The figure shows the path from above, the energies, and the errors.
 
 run = lt.integrate(pendulum, x0, (0.0, 40.0), 0.02, lt.MetriplecticGauss(2))
 T = T0 * np.exp(run.x[:, 6] / C)

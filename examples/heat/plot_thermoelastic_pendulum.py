@@ -25,7 +25,7 @@ solution = lt.integrate(
 
 # %%
 # Both laws hold at every step. The energy of a spring enters by its squared length, a quadratic function of the state,
-# and so the discrete forces act along the springs: the angular momentum is kept to rounding as well.
+# and so the discrete forces act along the springs: the angular momentum is conserved to rounding as well.
 
 print(solution.audit())
 

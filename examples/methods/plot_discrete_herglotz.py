@@ -3,7 +3,7 @@ What does a variational integrator lose?
 ========================================
 
 The discrete Herglotz integrator comes from a discrete Lagrangian, not from a discrete gradient. On the damped
-oscillator it is cheap and explicit, and its path is accurate. But it keeps neither law exactly. These are the runs of
+oscillator it is cheap and explicit, and its path is accurate. But it obeys neither law exactly. These are the runs of
 Figures 5 and 6 of Anahory Simoes, Martín de Diego, Lainz Valcázar and de León (2020).
 """
 

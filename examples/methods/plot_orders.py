@@ -18,7 +18,7 @@ import liethermo as lt
 import manifolds as mf
 
 # %%
-# The two systems.
+# The two systems follow.
 
 so3, se3 = mf.so(3), mf.se(3)
 length = se3.casimirs(degree=2)[
@@ -51,7 +51,7 @@ cases = [
 ]
 
 # %%
-# Errors at t = 4 against a far finer run.
+# The errors at t = 4 are relative to a run with far smaller steps.
 
 STAGES, COUNTS, END = (1, 2, 3, 4), (4, 8, 16, 32, 64), 4.0
 figure, axes = plt.subplots(1, 2, figsize=(9, 4), sharey=True, layout="constrained")

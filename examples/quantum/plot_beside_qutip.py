@@ -55,7 +55,7 @@ def system(H, couplings):
 
 # %%
 # Lindblad's equation has jumps of one frequency each: in the eigenvectors of the Hamiltonian the entries of a coupling
-# with the same difference of energies. Each comes with its adjoint, and the two rates are in detailed balance.
+# with the same difference of energies. Each jump comes with its adjoint, and the two rates are in detailed balance.
 
 
 def jumps(H, couplings):

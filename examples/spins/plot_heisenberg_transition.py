@@ -2,10 +2,10 @@
 Where does a magnet lose its order?
 ===================================
 
-Spins on a cubic lattice want to be parallel to their neighbours, and a bath of constant temperature shakes them. Below
-a temperature they point one way, above it they do not: the magnet has a transition, at ``k T / J = 1.4429``. Binder's
-cumulant of the magnetisation tells where: it hardly depends on the size of the lattice there. These are short runs.
-Long ones, with their errors and beside Monte Carlo, are on the page about a magnet at its transition.
+The energy of spins on a cubic lattice favours parallel neighbours, and the noise of a bath of constant temperature
+disorders them. The magnet has a transition at ``k T / J = 1.4429``: below this temperature the spins point in one
+direction. At the transition Binder's cumulant of the magnetisation hardly depends on the size of the lattice. These
+runs are short. :doc:`/explanation/magnet` has long runs with error bars and compares them with Monte Carlo.
 """
 
 import matplotlib.pyplot as plt
@@ -41,7 +41,7 @@ def magnetisations(length, temperature, steps=1600):
 
 
 # %%
-# Magnetisation, specific heat and cumulant of two lattices.
+# The figure shows magnetisation, specific heat and cumulant of two lattices.
 
 figure, axes = plt.subplots(1, 3, figsize=(10, 3.2), layout="constrained")
 for length, colour in ((4, "#0072B2"), (6, "#D55E00")):

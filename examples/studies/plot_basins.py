@@ -2,8 +2,8 @@
 To which of three equilibria does a body go?
 ============================================
 
-The energy of a body has three minima on the sphere of its momentum. A double bracket lowers the energy and keeps the
-size of the momentum. Most motions first go round the sphere, so the basins of the three equilibria are wound around
+The energy of a body has three minima on the sphere of its momentum. A double bracket lowers the energy and conserves
+the size of the momentum. Most motions first go round the sphere, so the basins of the three equilibria are wound around
 each other.
 """
 

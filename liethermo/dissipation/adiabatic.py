@@ -109,7 +109,7 @@ class AdiabaticJumps(ThermalJumps):
     def bind_to(self, system):
         structure = self._checked_structure(system)
         if system.baths is None:
-            raise InputError("AdiabaticJumps exchange heat with a bath: give the system baths=lt.HeatBaths(...)")
+            raise InputError("AdiabaticJumps exchange heat with a bath. Give the system baths=lt.HeatBaths(...)")
         body_energy = system.energy.body if isinstance(system.energy, BodyBathsEnergy) else system.energy
         if is_traced(body_energy):
             groups = _distinct_pair_groups(structure.size)

@@ -73,7 +73,7 @@ class Dissipation(Module):
 
     @property
     def preserves_casimirs(self) -> bool:
-        """True if the force keeps every Casimir, for any gradients: it lies in the range of Pi(x)."""
+        """True if the force conserves every Casimir, for any gradients: it lies in the range of Pi(x)."""
         return False
 
     @property

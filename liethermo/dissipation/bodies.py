@@ -34,7 +34,7 @@ class HeatConduction(Dissipation):
     is constant, and the total entropy grows by ``sum k_ij (T_i - T_j)^2 / (T_i T_j)`` over the edges. In metriplectic
     form K is the sum of ``k_ij T_i T_j w w^T`` with ``w = e_i / T_i - e_j / T_j``.
 
-    The temperatures are components of the gradient passed, so a discretisation uses discrete ones, which keep both laws
+    The temperatures are components of the gradient passed, so a discretisation uses discrete ones, which obey both laws
     for every energy. With ``factors="midpoint"`` only the Fourier factors are evaluated at the point x instead, as
     printed in SML §6.2. The energy is constant then too, but the entropy is known to grow only for quadratic energies
     [SML Lemma 6.2].

@@ -34,7 +34,7 @@ from .geometry import isotropic_size, isotropic_vector
 
 
 class DoubleBracket(Damping):
-    """Double bracket: keeps every Casimir and lowers the energy [Bloch, Krishnaprasad, Marsden, Ratiu 1996].
+    """Double bracket: conserves every Casimir and lowers the energy [Bloch, Krishnaprasad, Marsden, Ratiu 1996].
 
     ``x' = Pi dH + rate * Pi (Pi dH)^♯``, that is ``ad*_xi mu + rate * ad*_sigma mu`` with ``sigma = (ad*_xi mu)^♯``
     on a Lie algebra, so ``H' = -rate |Pi dH|^2 <= 0``. It needs no entropy. An entropy of the system must be a Casimir,

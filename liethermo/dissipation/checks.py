@@ -121,7 +121,7 @@ def check_form_shape(form, dim: int, what: str) -> None:
         traced_function_and_shape(form, [(dim,)], [(dim, dim)], what, f"a state of shape ({dim},)")
     elif form.shape != (dim, dim):
         raise InputError(
-            f"{what} must be a ({dim}, {dim}) matrix for a state of {dim} components, not shape {form.shape}"
+            f"{what} must be a ({dim}, {dim}) matrix for a state of {dim} components, got shape {form.shape}"
         )
 
 

@@ -1,4 +1,4 @@
-"""Friction: against the surroundings, which take the energy, by a matrix that the user gives, and as a force."""
+"""Kinds of friction: against the surroundings, with a friction matrix of the user, and as a force."""
 
 from __future__ import annotations
 

@@ -245,7 +245,7 @@ class BathConduction(HeatConduction):
         last = int(np.max(np.asarray(self.second_bodies), initial=0))
         if last >= n_baths:
             raise InputError(
-                f"BathConduction joins bath {last}, but there are {n_baths} baths, numbered from 0: give the system "
+                f"BathConduction joins bath {last}, but there are {n_baths} baths, numbered from 0. Give the system "
                 f"baths=lt.HeatBaths(..., number={last + 1})"
             )
         return self

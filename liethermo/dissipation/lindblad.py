@@ -171,7 +171,7 @@ class LindbladJumps(Dissipation):
 
     def _require_time(self, time) -> None:
         if self.depends_on_time and time is None:
-            raise InputError("a rate or an operator of LindbladJumps depends on time: take system.at_time(t)")
+            raise InputError("a rate or an operator of LindbladJumps depends on time. Use system.at_time(t)")
 
 
 class OperatorFunction(Module):

@@ -43,7 +43,7 @@ class DissipationPotential(Dissipation):
     dS]`` in the algebra, and heat conduction has one force for each pair of bodies.
 
     If psi is convex with its minimum at zero, ``S' = (B^T dS) . grad psi(B^T dS) >= 0``, and ``B^T dH = 0`` for the
-    discrete gradient too: so every method keeps both laws as for K. The potential ``|f|^2 / 2`` gives K itself.
+    discrete gradient too: so every method obeys both laws as for K. The potential ``|f|^2 / 2`` gives K itself.
     ``system.check()`` tests that psi is convex with its minimum at zero, and building a system rejects any other psi.
     At a kink of psi the slope that JAX returns is used; the iterations of implicit methods need a continuous slope.
 
@@ -158,7 +158,9 @@ class CoulombFriction(NamedPotential):
     Parameters
     ----------
     strength : float, >= 0
+        Largest flux.
     width : float, > 0
+        Force below which the flux is linear.
     each : bool
         Apply the potential to every force by itself, or to their length (by default).
     """
@@ -186,7 +188,9 @@ class PowerLawFriction(NamedPotential):
     Parameters
     ----------
     exponent : float, > 1
+        p, the exponent of the potential.
     strength, width : float, >= 0
+        Coefficient, and the force below which the flux is linear.
     each : bool
         Apply the potential to every force by itself, or to their length (by default).
     """
@@ -220,7 +224,9 @@ class ActivatedFriction(NamedPotential):
     Parameters
     ----------
     rate : float, >= 0
+        Coefficient of the friction for small forces.
     scale : float, > 0
+        Force above which the flux grows exponentially.
     each : bool
         Apply the potential to every force by itself, or to their length (by default).
     """

@@ -157,6 +157,7 @@ class LocalProjectedMetric(Dissipation):
     Parameters
     ----------
     rate : float >= 0, or array of the shape of the sites
+        Rate of the dissipation at each site.
     cometric : array, shape (d, d), optional
         G of one site, positive definite; the identity by default.
     """

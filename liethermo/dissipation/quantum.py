@@ -105,11 +105,11 @@ class ThermalJumps(Dissipation):
     operators: tuple[Operator, ...] = eqx.field(static=True)
     rates: tuple[Any, ...]
     bath: int = eqx.field(static=True)
-    jumps: tuple[Jump, ...] = eqx.field(static=True)
-    jump_frame: Operator | None = eqx.field(static=True)
-    level_order: tuple[int, ...] = eqx.field(static=True)
+    jumps: tuple[Jump, ...] = eqx.field(static=True, repr=False)
+    jump_frame: Operator | None = eqx.field(static=True, repr=False)
+    level_order: tuple[int, ...] = eqx.field(static=True, repr=False)
     is_driven: bool = eqx.field(static=True)
-    timed_rates: tuple[int, ...] = eqx.field(static=True)
+    timed_rates: tuple[int, ...] = eqx.field(static=True, repr=False)
     is_isolated: bool = eqx.field(static=True)
     conserves_energy: bool = eqx.field(static=True)
 
@@ -342,7 +342,7 @@ class ThermalJumps(Dissipation):
         rate = self.rates[i]
         if i in self.timed_rates:
             if time is None:
-                raise InputError(f"the rate of V[{i}] depends on time: take system.at_time(t)")
+                raise InputError(f"the rate of V[{i}] depends on time. Use system.at_time(t)")
             return jnp.asarray(rate(omega, T, time))
         return jnp.asarray(rate(omega, T) if callable(rate) else rate)
 
@@ -445,13 +445,13 @@ def _jump_gain_table(jumps: tuple[Jump, ...]) -> tuple[np.ndarray, np.ndarray, n
 
 def _checked_rate_function(rate: Callable, i: int) -> Callable:
     """Return a rate function of omega and T, or of omega, T and t, tested at omega = T = 1 and t = 0."""
-    what = f"the rate of V[{i}] is a number, or a function of omega and T, or of omega, T and t, to a number >= 0"
+    what = f"the rate of V[{i}] must be a number >= 0, or a function of (omega, T) or (omega, T, t) that returns one"
     try:
         value = rate(*(1.0, 1.0, 0.0)[: 3 if _takes_time(rate) else 2])
     except TypeError as error:
         raise InputError(f"{what}: {error}") from None
     if np.shape(value) or jnp.result_type(value).kind not in "fiu":
-        raise InputError(f"{what}, not to {value!r}")
+        raise InputError(f"{what}, got {value!r}")
     if not isinstance(value, jax.core.Tracer) and value < 0.0:
         raise InputError(f"{what}: at omega = 1 and T = 1 it is {float(value):.6g}")
     return rate

@@ -24,7 +24,7 @@ class TracedCondition(NamedTuple):
     holds : traced truth value
     value : traced array
     message : str
-        The message of the error, with a placeholder: ``"a rate must be >= 0, not {value}"``.
+        The message of the error, with a placeholder: ``"a rate must be >= 0, got {value}"``.
     """
 
     holds: Any

@@ -172,6 +172,7 @@ class Kinetic(Energy):
     Parameters
     ----------
     G : array, shape (n, n) symmetric, or (n,) for a diagonal matrix; or function from q, shape (n,), to one
+        The mass matrix (mass).
     """
 
     G: jax.Array | Callable
@@ -223,6 +224,7 @@ class Potential(Pullback):
     Parameters
     ----------
     V : function from q, shape (n,), and S, a scalar, to a scalar
+        The potential (energy).
     """
 
     def __init__(self, V: Callable):

@@ -473,7 +473,7 @@ def _pieces_of_spline(spline: Any) -> tuple[jax.Array, jax.Array]:
         spline = _bspline_on_its_interval(spline)
     if not isinstance(spline, scipy.interpolate.PPoly):
         raise InputError(
-            "a table is made of a piecewise polynomial of SciPy or of times and values, not of "
+            "a table must be a piecewise polynomial of SciPy, or times and values, got "
             f"{type(spline).__name__}. Write Table(times, function(times), kind='cubic') with times at which its "
             "values are to be taken"
         )

@@ -189,7 +189,7 @@ def stochastic_method(
     lowering_terms = [part for part in system.total_dissipation.terms if part.energy_law != "conserved"]
     if lowering_terms and temperature is None:
         raise InputError(
-            f"{type(lowering_terms[0]).__name__} lowers the energy: give the temperature of the bath that takes it, "
+            f"{type(lowering_terms[0]).__name__} lowers the energy. Give the temperature of the bath that takes it, "
             "lt.Fluctuations(boltzmann, seed, temperature=...)"
         )
     if temperature is not None and not lowering_terms:

@@ -50,7 +50,7 @@ def composed_entropy_gradients(
 
     Each is ``sum_j (f_j(c_i) + alpha r_ij) gC_ij``, a combination of the discrete gradients of the Casimirs at the
     stage. Their rates are ``r_ij = gC_ij . k_i``, and their values ``c_i = C(x) + h sum_l A_il r_l`` are collocated as
-    separate unknowns. The number alpha makes ``h sum_i b_i gS_i . k_i = S(x') - S(x)``. So a motion that keeps
+    separate unknowns. The number alpha makes ``h sum_i b_i gS_i . k_i = S(x') - S(x)``. So a motion that conserves
     the Casimirs keeps S. At a critical point of f, f' is zero, and so is gS. With the stage u_i
     itself, which is off the level of the Casimirs by O(h^{s+1}), friction would act there.
 

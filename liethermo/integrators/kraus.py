@@ -98,7 +98,7 @@ class KrausMethod(OneStepMethod):
         if not terms or not all(isinstance(term, LindbladJumps) for term in terms):
             raise InputError(
                 "KrausMethod needs lt.LindbladJumps and no other dissipation. For lt.ThermalJumps use "
-                "lt.MetriplecticGauss, which keeps the laws of the energy and the entropy"
+                "lt.MetriplecticGauss, which obeys the laws of the energy and the entropy"
             )
 
     def start(self, system: System, x) -> jax.Array:

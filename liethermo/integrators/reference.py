@@ -16,7 +16,7 @@ from ..tracing.programs import jit_cached
 class Reference:
     """SciPy's ``solve_ivp`` on the vector field, as a reference for errors and as an example of an ordinary solver.
 
-    It keeps neither law: energy and entropy drift with the tolerance. ``step`` is only the spacing of the output.
+    It obeys neither law: energy and entropy drift with the tolerance. ``step`` is only the spacing of the output.
 
     Parameters
     ----------

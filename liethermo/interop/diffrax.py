@@ -108,6 +108,6 @@ class Solver(diffrax.AbstractAdaptiveSolver):
         system = getattr(terms, "term", terms).system
         if system.is_driven:
             raise InputError(
-                "an energy that depends on time needs a clock and a ledger in the state: use lt.integrate or lt.flow"
+                "an energy that depends on time needs a clock and a ledger in the state. Use lt.integrate or lt.flow"
             )
         return system, trace_energies(self.method.on(system), system.dim)

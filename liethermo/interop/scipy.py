@@ -142,7 +142,7 @@ def solve_ivp(
     arguments = _checked_args(args)
     is_terminal = any(getattr(function, "terminal", False) for function in functions)
     if math.isinf(end) and not is_terminal:
-        raise InputError("an infinite end needs an event that ends the run: set event.terminal = True, or a finite end")
+        raise InputError("an infinite end needs an event that ends the run. Set event.terminal = True, or a finite end")
     method = MetriplecticRungeKutta(order=8) if method is None else method
     step = Adaptive(
         _scalar_tolerance("rtol", rtol, y0),

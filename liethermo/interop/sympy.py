@@ -166,7 +166,7 @@ def function(expression: Any, variables: Sequence[sympy.Symbol]) -> Callable:
             if subexpression.args and _jax_function(subexpression, variables) is None
         )
         raise InputError(
-            f"{unknown.func.__name__} in {unknown} has no counterpart in JAX: write the function with jax.numpy"
+            f"{unknown.func.__name__} in {unknown} has no counterpart in JAX. Write the function with jax.numpy"
         )
     return jax_function
 

@@ -50,7 +50,9 @@ def save(system: System, path: str | os.PathLike) -> Path:
     Parameters
     ----------
     system : System
+        The system whose parameters are saved.
     path : path
+        The file to write.
 
     Raises
     ------
@@ -75,6 +77,7 @@ def load(path: str | os.PathLike, system: T) -> T:
     Parameters
     ----------
     path : path
+        The file to read.
     system : System
         A system built like the one that was fitted, such as by the same function, because the file holds arrays only.
         Its own arrays do not matter.
@@ -95,7 +98,7 @@ def load(path: str | os.PathLike, system: T) -> T:
     if metadata.get("kind") != system.kind or shapes[0] != shapes[1]:
         raise FileError(
             f"{path!s:.200} holds a {metadata.get('kind')} with {len(saved_leaves)} arrays, which does not match the "
-            f"number and shapes of the {len(leaves)} of this {system.kind}: pass a system built like the saved one"
+            f"number and shapes of the {len(leaves)} of this {system.kind}. Pass a system built like the saved one"
         )
     loaded_system = eqx.combine(jax.tree_util.tree_unflatten(structure, list(map(jnp.asarray, saved_leaves))), static)
     if not all(np.isfinite(x).all() for x in saved_leaves if x.dtype.kind == "f"):

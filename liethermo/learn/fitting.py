@@ -120,10 +120,10 @@ def fit(
     noise : float, str, or sequence of them, length n, optional
         Standard deviation of the errors of the data, one number or one for each number observed, in the units of the
         system: in SI units for a table with units. A text has a unit of its own: ``noise="0.5 deg/s"`` is 0.00873
-        rad/s. Splines then smooth the data, losses are relative to it, and the fit
-        also finds the initial states of the short runs. By default it is estimated from the data, by differences that a
-        motion does not have; errors below a thousandth of the spread of the data are left out of account. Least squares
-        only take it from the residuals, where the differences do not show it. 0 says that the data are exact.
+        rad/s. Splines then smooth the data, losses are relative to it, and the fit also finds the initial states of the
+        short runs. By default it is estimated from the data, by differences that a motion does not have; errors below a
+        thousandth of the spread of the data are left out of account. Least squares only take it from the residuals,
+        where the differences do not show it. 0 says that the data are exact.
     observed : sequence of int, optional
         Indices of the components that were measured; the data then have shape (m, len(observed)).
     observe : function, optional

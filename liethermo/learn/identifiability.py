@@ -92,6 +92,7 @@ def determined(
     Parameters
     ----------
     system : System
+        The system, with the parameters of the fit.
     observed : function from such a system to an array
         The observed quantities, in units in which all are known about equally well: ``lambda s: s.vector_field(x)`` at
         the states x of the data, or the states of a run by ``lt.flow``.
@@ -138,6 +139,7 @@ class Fits:
     Attributes
     ----------
     systems : tuple of System
+        The fitted systems.
     """
 
     systems: tuple[System, ...]

@@ -185,7 +185,7 @@ def make_observation(
         description = f"observe could not be evaluated on a state of shape ({system.dim},){arguments_text}"
         raise FunctionError(trace_error_message(description, error)) from error
     if not jnp.issubdtype(output_shape.dtype, jnp.floating):
-        raise FunctionError(f"observe must return real numbers, not {output_shape.dtype}")
+        raise FunctionError(f"observe must return real numbers, got {output_shape.dtype}")
     return Observation(
         function, output_shape.shape, np.zeros(0, int), group, False, tuple(names), "parameters" in kinds
     )

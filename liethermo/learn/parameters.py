@@ -68,7 +68,7 @@ def build_checked(system: System | Callable, values: Mapping[str, Any]) -> Syste
     except KeyError as error:
         raise InputError(f"the system needs the parameter {error}. Add it to parameters=") from None
     if not isinstance(built_system, System):
-        raise InputError(f"the function that builds the system must return a system, not {type(built_system).__name__}")
+        raise InputError(f"the function that builds the system must return a system, got {type(built_system).__name__}")
     try:
         jax.eval_shape(lambda values: ravel_pytree(system_with_parameters(system, values))[0], dict(values))
     except TRACE_ERRORS as error:

@@ -35,6 +35,7 @@ class Learned(Module):
     Parameters
     ----------
     function : function of arrays, such as an ``equinox.Module``
+        The function with the fitted parameters.
     """
 
     function: Callable
@@ -211,6 +212,7 @@ class Poisson(mf.PoissonStructure):
     Parameters
     ----------
     dim : int
+        Number of components of the state.
     width, depth, seed
         As for :class:`Energy`.
     function : function from x, shape (dim,), to the entries above the diagonal, row by row; optional
@@ -283,9 +285,11 @@ class Friction(Dissipation):
     Parameters
     ----------
     dim : int
+        Number of components of the state.
     rank : int
         Number of columns of B, the number of dissipation channels.
     construction : {"skew", "projected"}
+        The form that conserves the energy.
     width, depth, seed
         As for :class:`Energy`.
     function : function from x, shape (dim,), to the numbers of all columns, one after another; optional

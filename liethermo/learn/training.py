@@ -89,6 +89,7 @@ class Training(metaclass=ListedType):
     step : ndarray of int, shape (evaluations,)
         Number of steps before each evaluation, summed over phases.
     phase : ndarray of str, shape (evaluations,)
+        Phase of each evaluation.
     loss : ndarray, shape (evaluations,)
         Mean loss of the steps since the last evaluation. Mean squares: in the matching relative to the speed of the
         state, in the shooting relative to the spread of the data or the noise.
@@ -125,6 +126,7 @@ class Training(metaclass=ListedType):
     noise : ndarray, shape (k,)
         Standard deviations of the errors of the data, given or estimated; empty if the data count as exact.
     noise_is_estimated : bool
+        True if the noise was estimated from the residuals.
     degrees_of_freedom : int
         Number of observations minus the number of determined unknowns of the least squares.
     initial_states : ndarray, shape (trajectories, n)
@@ -273,7 +275,7 @@ class Training(metaclass=ListedType):
         ]
         if undetermined:
             messages.append(
-                f"the data do not determine {', '.join(undetermined)}: give more data, or leave known numbers out of "
+                f"the data do not determine {', '.join(undetermined)}. Give more data, or leave known numbers out of "
                 "the fit"
             )
         max_residual = MAX_RESIDUAL_TO_NOISE
@@ -421,7 +423,7 @@ class TrainingRun:
             if not np.isfinite(loss):
                 raise InputError(
                     f"the loss is {loss} after {step} steps, in the {phase.name}: the runs leave the domain of the "
-                    "functions or the steps are too long; try a smaller rate, or more substeps"
+                    "functions or the steps are too long. Try a smaller rate, or more substeps"
                 )
             self.evaluations_since_best = (
                 0 if compared_loss < IMPROVEMENT_FACTOR * self.best_loss else self.evaluations_since_best + 1
@@ -471,7 +473,7 @@ class TrainingRun:
         metadata, arrays = read_archive(path, CHECKPOINT_FORMAT)
         if metadata.get("identity") != self.fit_fingerprint:
             raise FileError(
-                f"{path} is the checkpoint of a fit of another model, of other data or with other settings: give "
+                f"{path} is the checkpoint of a fit of another model, of other data or with other settings. Give "
                 "another path, or remove it"
             )
         self.phase_index, self.weights = metadata["index"], arrays["weights"]

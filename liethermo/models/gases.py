@@ -161,7 +161,7 @@ def cylinder(
         Amount of the monatomic gas (mol), and the height of the piston (m) at which its entropy is 0 at 300 K.
     pressure : float, or function of (q, v, S) or (q, v, S, t) to a scalar; optional
         External pressure P (Pa).
-    heat_power : float, or function likewise; optional
+    heat_power : float, or function of (q, v, S) or (q, v, S, t) to a scalar; optional
         External heating power of the gas (W).
     """
     n, m, A = checked_positive(moles, "moles"), checked_positive(mass, "mass"), checked_positive(area, "area")
@@ -384,6 +384,7 @@ def porous_piston(
     friction : float, >= 0
         Friction coefficient of the piston (mass / time).
     mass, area, length : float, > 0
+        Mass and area of the piston, length of the cylinder (kg, m**2, m).
     capacity : float, > 0
         C, the heat capacity of the piston.
     heat_capacity : float, > 0
@@ -473,11 +474,13 @@ def reaction_vessel(
     capacity, energy, entropy : sequences of K floats
         c_k > 0, e_k and s_k of :class:`IdealMixture`, Boltzmann's constant 1.
     volume : float, > 0
+        Volume of the vessel.
     rate : float, >= 0
         L of the :class:`liethermo.Reaction`.
     jacket : float, > 0
         Heat capacity of the jacket.
     conductance : float, >= 0
+        Heat conductance between mixture and jacket (power / temperature).
     """
     reaction = Reaction("vessel", stoichiometry, rate)
     count = len(reaction.stoichiometry)

@@ -183,7 +183,7 @@ def are_inertia_tensors(inertia) -> bool:
     if is_traced(inertia):
         raise InputError(
             f"inertia of shape {inertia.shape} may hold tensors or moments, which cannot be decided from a traced "
-            "array: give the moments of one body, shape (3,), and use jax.vmap for many"
+            "array. Give the moments of one body, shape (3,), and use jax.vmap for many"
         )
     blocks = np.asarray(inertia, dtype=np.float64)
     if not np.isfinite(blocks).all() or not is_symmetric(blocks):
@@ -197,7 +197,7 @@ def are_inertia_tensors(inertia) -> bool:
     if is_positive_definite and (blocks > 0.0).all():
         raise InputError(
             f"inertia must be moments or tensors of rigid bodies, got the symmetric array {blocks.tolist()}, which is "
-            "neither: give principal moments, shape (3,), one body at a time"
+            "neither. Give principal moments, shape (3,), one body at a time"
         )
     return True
 

@@ -78,7 +78,7 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         self._set_torque(torque)
         self.orbit = gravity if isinstance(gravity, Orbit) else None
         if self.orbit is not None and not attitude:
-            raise InputError("gravity along an orbit depends on the attitude: leave out attitude=False")
+            raise InputError("gravity along an orbit depends on the attitude. Leave out attitude=False")
         self.motors, self._joint_ranges = motors, joint_ranges
         terms = kinetic_and_spring_terms(mechanism, springs)
         poisson: PoissonStructure = ProductPoisson(mf.LiePoisson(algebra), mf.Canonical(k))

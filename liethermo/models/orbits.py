@@ -33,6 +33,7 @@ class Orbit(Module):
     radius : float, > 0, optional
         Semi-major axis a (m). Gravity does not need it: it follows from the mean motion.
     eccentricity : float, 0 <= e < 1
+        Eccentricity of the orbit.
     towards, normal : array, shape (3,)
         Directions in space, of any length and perpendicular: from the body to the centre at t = 0, and of the angular
         momentum of the orbit.

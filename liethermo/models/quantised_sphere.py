@@ -47,6 +47,7 @@ class QuantisedSphere:
     Parameters
     ----------
     N : int, >= 2
+        Size of the matrices.
 
     Attributes
     ----------
@@ -351,6 +352,7 @@ def zeitlin(N: int, decay: Literal["enstrophy", "energy"] | None = None, rate=0.
     Parameters
     ----------
     N : int, >= 2
+        Size of the matrices.
     decay : {"enstrophy", "energy"}, optional
         The function that decays; by default none.
     rate : float, >= 0
@@ -425,6 +427,7 @@ def magnetic_fluid(N: int, rate=0.0) -> LiePoissonSystem:
     Parameters
     ----------
     N : int, >= 2
+        Size of the matrices.
     rate : float, >= 0
         Rate of the decay (1 / time).
 

@@ -36,9 +36,9 @@ def rigid_body(
     ----------
     inertia : three positive numbers, or array of shape (3, 3)
         Principal moments of inertia, or the tensor in body axes (mass * length**2), or (0, J, J) for a slender rod,
-        whose momentum has no component along its axis. The moments of a body obey
-        ``I_i <= I_j + I_k``, since each is a sum of two of three moments of its masses. The default is the paper's
-        (Fig. 1), which does not: as equations on so(3)* they are as good as any, but no rigid body has them.
+        whose momentum has no component along its axis. The moments of a body obey ``I_i <= I_j + I_k``, since each is a
+        sum of two of three moments of its masses. The default is the paper's (Fig. 1), which does not: as equations on
+        so(3)* they are as good as any, but no rigid body has them.
     rate : float, >= 0
         lambda in ``mu' = mu x Omega + lambda Omega x (mu x Omega)`` (time). 1 is the equation as printed in the paper,
         where 𝒦 is the dot product. It is ``KillingDissipation(rate / 2)``, since the Killing form of so(3) is -2 times

@@ -73,6 +73,7 @@ def toda_flow(n: int) -> LiePoissonSystem:
     Parameters
     ----------
     n : int, >= 2
+        Number of particles.
 
     Returns
     -------
@@ -92,7 +93,7 @@ def hermitian_state(L) -> jax.Array:
     """
     matrix = np.asarray(L)
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1] or not np.allclose(matrix, matrix.conj().T, atol=1e-12):
-        raise InputError(f"L must be a Hermitian matrix, got an array of shape {matrix.shape}: take (L + L^H) / 2")
+        raise InputError(f"L must be a Hermitian matrix, got an array of shape {matrix.shape}. Use (L + L^H) / 2")
     basis = mf.u(len(matrix)).basis
     return jnp.asarray(np.einsum("ij,aji->a", -1j * matrix, basis).real)
 

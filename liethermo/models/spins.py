@@ -65,10 +65,13 @@ def spin_lattice(
     Parameters
     ----------
     sites : int or tuple of int
+        Shape of the lattice.
     exchange_constant : float, array or graph
         J: see :func:`liethermo.magnetism.exchange`; a symmetric matrix or a list of edges puts the spins on a graph.
     anisotropy_constant : float, or array of the shape of the sites
+        Energy of the easy axis of a spin.
     field : array, shape (3,) or ``(*sites, 3)``
+        The external field.
     dmi : array, list of edges, or None
         D: see :func:`liethermo.magnetism.dzyaloshinskii_moriya`.
     rate : float >= 0, or array of the shape of the sites
@@ -79,6 +82,7 @@ def spin_lattice(
     bath : array of int, of the shape of the sites, optional
         Index of the bath that each site heats.
     periodic : bool or tuple of bool
+        Periodic boundaries, of all axes or of each.
     axis : array, shape (3,) or ``(*sites, 3)``
         Axis of the anisotropy.
     """
@@ -127,6 +131,7 @@ def micromagnet(
     Parameters
     ----------
     cells : tuple of three int
+        Numbers of cells along the three axes.
     size : float, or tuple of three floats
         Edges of a cell (m).
     saturation : float

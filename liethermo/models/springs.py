@@ -122,7 +122,9 @@ def thermoelastic_chain(
     mass, capacity, length, temperature : float, > 0
         Mass of each body; capacity, length and temperature of each spring: see :class:`Thermospring`.
     stiffness : float, > 0
+        Stiffness of the springs (force / length).
     expansion : float
+        Coupling of length and temperature: see :class:`Thermospring`.
     conductance : float, >= 0
         Heat conductance between neighbouring springs (power / temperature).
     gravity : float

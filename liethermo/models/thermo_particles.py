@@ -80,6 +80,7 @@ def moving_thermo_particles(
     Parameters
     ----------
     masses : sequence of float, > 0
+        Masses of the particles.
     capacities, conductance
         As for :func:`thermo_particles`.
     dimension : int
@@ -112,7 +113,9 @@ def thermo_springs(
     Parameters
     ----------
     masses, stiffness, capacities : float, > 0
+        Masses of the bodies, stiffness of the spring, heat capacities of the bodies.
     conductance : float, >= 0
+        Heat conductance between the bodies (power / temperature).
     friction, drag : float, >= 0
         Coefficients of linear friction of either body on its surroundings, and between the two (mass / time).
     """

@@ -126,7 +126,7 @@ class GravityGradient(Module):
         details = {name: value for name, value in details.items() if value is not None}
         is_circular = eccentricity is None and not isinstance(mean_motion, Orbit)
         if isinstance(mean_motion, Orbit) and details:
-            raise InputError(f"an Orbit has {' and '.join(details)} of its own: give them to lt.torques.Orbit")
+            raise InputError(f"an Orbit has {' and '.join(details)} of its own. Give them to lt.torques.Orbit")
         orbit = mean_motion if isinstance(mean_motion, Orbit) else Orbit(mean_motion, **details)
         self.inertia = jnp.asarray(checked_inertia(inertia, allow_rod=True))
         self.mean_motion, self.towards, self.normal = orbit.mean_motion, orbit.towards, orbit.normal

@@ -154,6 +154,7 @@ class Audit(Tabular):
         tolerance ``accuracy``. It is about single steps and not about the accumulated error. None without information
         about the steps.
     rows : tuple of AuditRow
+        The rows of the table.
     coverage : str
         Number of steps that were checked, if not all; the verdict says it too.
 
@@ -404,7 +405,7 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
     rows.append(
         AuditRow(
             STEPS_TAKEN_ROW,
-            float(stats.steps),
+            stats.steps,
             None,
             False if has_failed else None,
             "" if status.ok else str(status.code),
@@ -469,7 +470,7 @@ def accuracy_row(evidence: Evidence, tolerances: Tolerances) -> AuditRow:
     row = _judged_row(ACCURACY_ROW, evidence.local_error, tolerances.accuracy)
     location = f"largest local error, relative to the length of the step; worst at t = {evidence.error_time:.4g}"
     return replace(
-        row, note=location if row.passed else f"the steps do not resolve the motion: try suggest_step; {location}"
+        row, note=location if row.passed else f"the steps do not resolve the motion. Try suggest_step; {location}"
     )
 
 

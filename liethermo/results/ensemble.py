@@ -81,8 +81,8 @@ class Ensemble(AuditableResult):
         Indices in ``STATUS_NAMES``: 0 completed, 1 not converged, 2 not finite, 3 interrupted, 4 ended by its event, 5
         and 6 adaptive steps that were too short or too many, 8 inadmissible: a trajectory that could not be started,
         with its parameters or from its state.
-    steps : ndarray of int64, shape (B,)
-        Number of steps taken; if the status is a failure, the next step failed.
+    steps, rejected, iterations : ndarray, shape (B,)
+        Numbers of steps taken, of adaptive steps that were too long, and of solver iterations.
     residual : ndarray, shape (B,)
         ``h |k - slopes(k)| / |x|`` of the last attempted step.
     energy_drift : ndarray, shape (B,)
@@ -93,30 +93,21 @@ class Ensemble(AuditableResult):
         ``max(|S(0)|, |S(T)|)``.
     energy_sensitivity, entropy_sensitivity : ndarray, shape (B,)
         Largest :meth:`liethermo.Energy.sensitivity` over every step, relative to which rounding is judged.
-    first_energy : ndarray, shape (B,)
-    entropy_change : ndarray, shape (B,)
-        ``S(T) - S(0)``.
+    first_energy, entropy_change : ndarray, shape (B,)
+        ``H(0)`` and ``S(T) - S(0)``.
     relaxation_time : ndarray, shape (B,)
         ``int_0^T (S(T) - S(t)) dt / (S(T) - S(0))``, T the end of the trajectory: the time constant of an exponential
         relaxation that is over by T. Under a double bracket the energy replaces S. NaN if nothing relaxes.
-    iterations : ndarray, shape (B,)
-        Total number of solver iterations.
     smallest_energy, largest_energy : ndarray, shape (B,)
         Extremes over every step, less the work done from outside.
     end_time : ndarray, shape (B,)
         Time reached.
-    rejected : ndarray of int64, shape (B,)
-        Number of attempted adaptive steps that were too long.
     x0 : ndarray, shape (B, n); on sites, as x, with ``(*sites, d)`` instead of n
         Initial states.
-    laws : Laws
-    engine : str
-    wall_time : float
-        Seconds, compilation included.
-    attitude : ndarray, shape (B, m, m) or (B, times, m, m), or None
-        Elements of the group, if the system has one and states are kept.
-    attitude0 : ndarray, shape (B, m, m), or None
-        Attitudes at the start.
+    laws, engine, wall_time : Laws, str, float
+        The laws that the audit checks, the engine, and the seconds of the run, with compilation.
+    attitude, attitude0 : ndarray, shape (B, m, m) or (B, times, m, m), or None
+        Elements of the group, if the system has one and states are kept, and those at the start.
     work : ndarray, shape (B,) or (B, times), or None
         Work done on the system from outside, if its energy depends on time; the drift and the increments of the energy
         are then those of the energy less the work.
@@ -124,7 +115,7 @@ class Ensemble(AuditableResult):
         The events of each function of ``until``: ``e.events[k]`` has times ``t``, states ``x`` and numbers
         ``trajectory``.
     reasons : mapping from int to str
-        Why trajectories are inadmissible, or have failed if that is known.
+        Why trajectories are inadmissible, or have failed.
     provenance : dict
         Library version, method, step, system, date: JSON data.
     """
@@ -315,10 +306,9 @@ class Ensemble(AuditableResult):
     ) -> Audit:
         """Audit the laws at every step of every trajectory; each row shows the worst trajectory.
 
-        Local errors are measured along at most 32 trajectories, from their start as far as is affordable; with adaptive
-        steps, in the first step. Conserved functions, and conditions such as the positivity of density matrices, are
-        evaluated at the saved states of the same trajectories, at their ends if only these are kept, and not with
-        ``outputs="summary"``. If not all steps were checked, the verdict says how many.
+        Local errors are measured along at most 32 trajectories (with adaptive steps, in the first step). Conserved
+        functions, and conditions such as the positivity of density matrices, are evaluated at the saved states of these
+        trajectories. If not all steps were checked, the verdict says how many.
 
         Parameters
         ----------
@@ -328,7 +318,6 @@ class Ensemble(AuditableResult):
         Raises
         ------
         InputError
-            If the name of a tolerance is unknown, or a tolerance is negative.
         """
         limits = Tolerances.with_defaults(energy=energy, entropy=entropy, **tolerances)
         has_stepped, drifts = self.steps > 0, self.evidence.drifts
@@ -340,7 +329,7 @@ class Ensemble(AuditableResult):
         if self.evidence_source is not None or self.evidence.local_error is not None:
             rows.append(accuracy_row(self.evidence, limits))
         n_failed = int((~self.ok & (self.status != StatusCode.INTERRUPTED)).sum())
-        rows.append(AuditRow(FAILED_TRAJECTORIES_ROW, float(n_failed), 0.0, n_failed == 0))
+        rows.append(AuditRow(FAILED_TRAJECTORIES_ROW, n_failed, 0, n_failed == 0))
         min_entropy_increment = (
             np.nan if self.entropy is None else float(self.least_entropy_increment.min(initial=0.0, where=has_stepped))
         )
@@ -350,6 +339,10 @@ class Ensemble(AuditableResult):
         return Audit(drift, min_entropy_increment, casimir_drift, residual, tuple(rows), coverage)
 
     # -- files --------------------------------------------------------------------------------------------------------
+
+    def __repr__(self) -> str:
+        completed = int(np.sum(self.ok))
+        return f"Ensemble({len(self.status)} trajectories to t = {np.max(self.end_time):g}, {completed} completed)"
 
     def to_xarray(self, units: Mapping[str, str] | None = None) -> xarray.Dataset:
         """Return an ``xarray.Dataset`` with coordinates ``trajectory`` and ``time``; all else is in attributes (JSON).

@@ -66,6 +66,7 @@ def write_csv(
     Parameters
     ----------
     path : path
+        The file to write.
     solution : Solution
         A result of a body with attitudes in SO(3), with the second as its unit of time.
     degrees : bool
@@ -86,7 +87,7 @@ def write_csv(
     """
     q = quaternions(solution, scalar)
     if q.shape != (*np.shape(solution.t), 4):
-        raise InputError("a file has one history: write each trajectory of an ensemble, write_csv(path, e[i])")
+        raise InputError("a file has one history. Write each trajectory of an ensemble, write_csv(path, e[i])")
     quaternion_names = QUATERNION_COLUMNS if scalar == "last" else np.roll(QUATERNION_COLUMNS, 1).tolist()
     names, columns = ["t [s]", *quaternion_names], [np.asarray(solution.t)[:, None], q]
     if "angular_velocity" in solution.velocity_sources:
@@ -114,6 +115,7 @@ def read_csv(path: str | os.PathLike) -> AttitudeHistory:
     Parameters
     ----------
     path : path
+        The file to read.
 
     Returns
     -------

@@ -138,15 +138,13 @@ class SaveableResult(metaclass=ListedABCMeta):
         Parameters
         ----------
         path : path
+            The file to write.
         units : dict of str, optional
             Units by the name of a variable: see :meth:`to_xarray`.
 
         Raises
         ------
-        FileError
-            If the file cannot be written.
-        InputError
-            If there is no variable of a name in ``units``.
+        FileError, InputError
         """
         return write_dataset(self.to_xarray(units), path)
 

@@ -74,7 +74,7 @@ def rotation(solution: AuditableResult) -> Rotation:
     """
     g = _attitudes(solution)
     if not np.isfinite(g).all():
-        raise InputError("some trajectories have ended early, so not all attitudes are known: take rotation(e[i])")
+        raise InputError("some trajectories have ended early, so not all attitudes are known. Use rotation(e[i])")
     return Rotation.from_matrix(g)
 
 
@@ -393,7 +393,7 @@ def _attitudes(solution: AuditableResult) -> np.ndarray:
         raise InputError(f"attitudes are those of a solution or an ensemble, got {solution!r:.60}")
     if solution.attitude is None:
         raise InputError(
-            "there are no attitudes: give the system a group, such as group=mf.SO(3), or a model of a body "
+            "there are no attitudes. Give the system a group, such as group=mf.SO(3), or a model of a body "
             "attitude=True, and keep states"
         )
     if solution.provenance.get("group") not in ROTATION_GROUPS:

@@ -202,14 +202,21 @@ class Solution(AuditableResult):
     Attributes
     ----------
     t : ndarray, shape (times,)
+        Times of the saved states.
     x : ndarray, shape (times, n), or ``(times, *sites, d)`` of a system on sites
+        Saved states.
     energy : ndarray, shape (times,)
+        Energy at these times, with that of the baths.
     entropy : ndarray, shape (times,), or None
+        Entropy at these times; None for a system without one.
     casimirs : dict of ndarray, shape (times,)
         Casimirs, momentum maps and preserved functions along the run, by name.
     status : Status
+        How the run ended.
     stats : Stats
+        Numbers of steps and iterations.
     laws : Laws
+        The laws that the audit checks.
     provenance : dict
         Library version, method, step, system, date, spec: JSON data.
     event_time : float or None
@@ -285,7 +292,6 @@ class Solution(AuditableResult):
         Raises
         ------
         InputError
-            If the name of a tolerance is unknown, or a tolerance is negative.
 
         Examples
         --------

@@ -63,17 +63,17 @@ class Adaptive:
         for name in ("rtol", "atol"):
             value = getattr(self, name)
             if not (isinstance(value, int | float) and math.isfinite(value) and value >= 0.0):
-                raise InputError(f"{name} must be a number >= 0, not {value!r}")
+                raise InputError(f"{name} must be a number >= 0, got {value!r}")
         if max(self.rtol, self.atol) == 0.0:
             raise InputError("rtol and atol are both zero: no step is that exact")
         if self.atol == 0.0 and self.rtol < 1e-14:
-            raise InputError(f"rtol = {self.rtol:g} is below the rounding of double precision; take 1e-14 or more")
+            raise InputError(f"rtol = {self.rtol:g} is below the rounding of double precision. Use 1e-14 or more")
         for name in ("first", "largest"):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0.0):
-                raise InputError(f"the {name} step must be positive and finite, not {value!r}")
+                raise InputError(f"the {name} step must be positive and finite, got {value!r}")
         if isinstance(self.most_steps, bool) or not isinstance(self.most_steps, int) or self.most_steps < 1:
-            raise InputError(f"most_steps must be a positive integer, not {self.most_steps!r}")
+            raise InputError(f"most_steps must be a positive integer, got {self.most_steps!r}")
 
     @property
     def tolerance(self) -> float:

@@ -242,7 +242,7 @@ def _checked_event_function(
     """
     names = ("t", "x") if scipy_arguments is not None else _argument_names(function)
     if "attitude" in names and not isinstance(system, AttitudeSystem):
-        raise InputError(f"{name} asks for the attitude, and this system has none: give it a group")
+        raise InputError(f"{name} asks for the attitude, and this system has none. Give it a group")
     call = _with_user_arguments(function, names, scipy_arguments or (), system)
     example = jax.eval_shape(lambda t, x: event_arguments(names, system, t, x), jnp.zeros(()), x)
     shapes = [argument.shape for argument in example]

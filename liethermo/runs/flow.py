@@ -168,9 +168,8 @@ def flow(
     -------
     array, shape (n,), or (times, n)
         The final state, the one at the end of t_span; with ``save_every`` states at several times, the final one last;
-        with ``save_at`` the states at these times.
-        ``(*sites, d)`` instead of n, of a system on sites. NaN from where a step could not be solved: inside a
-        compiled function nothing can be raised.
+        with ``save_at`` the states at these times. ``(*sites, d)`` instead of n, of a system on sites. NaN from where a
+        step could not be solved: inside a compiled function nothing can be raised.
 
     Raises
     ------

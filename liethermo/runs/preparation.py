@@ -42,7 +42,7 @@ from .system_family import Family
 Result = TypeVar("Result")
 
 MISSING_GROUP_MESSAGE = (
-    "an attitude is for a system with a group: give LiePoissonSystem one, such as group=mf.SO(3), or a model of a body "
+    "an attitude is for a system with a group. Give LiePoissonSystem one, such as group=mf.SO(3), or a model of a body "
     "attitude=True"
 )
 """Error message for an attitude of a system without a group."""

@@ -243,7 +243,7 @@ class Propagator(metaclass=ListedType):
             Other arguments of :func:`ensemble`, such as ``outputs="summary"``.
         """
         if self.engine == "sparse":
-            raise InputError('a propagator with engine="sparse" cannot run ensembles: leave out engine')
+            raise InputError('a propagator with engine="sparse" cannot run ensembles. Leave out engine')
         return ensemble(
             self.system,
             x0s,

@@ -51,6 +51,7 @@ class SteadyCycle:
     x : array, shape (n,)
         The state at the start of the period; the entropies of baths of constant temperature are zero.
     period : float
+        Period of the cycle (time).
     residual : float
         Distance of the ends of the cycle, relative to the norm of the state.
     multipliers : array, shape (m,), complex

@@ -85,6 +85,7 @@ class MethodSuggestion:
     method : OneStepMethod
     step : float
     reason : str
+        The reason for the choice, as a text.
     trials : tuple of Trial
         In order of increasing work.
     """

@@ -118,7 +118,7 @@ class Family:
         def rebuild(arrays):
             system = build(jax.tree_util.tree_unflatten(structure, arrays))
             if not isinstance(system, System):
-                raise InputError(f"the function must return a system, not {type(system).__name__}")
+                raise InputError(f"the function must return a system, got {type(system).__name__}")
             return system
 
         shapes = tuple(value.shape[1:] for value in values)

@@ -115,7 +115,7 @@ def event_status(outcome, names: Sequence[str], t: float) -> Status:
     steps, residual = int(outcome.state.step), float(outcome.state.residual)
     if outcome.event_time is not None:
         name = names[outcome.occurrences[-1].function]
-        return Status(StatusCode.EVENT, f"{name}: reached at t = {t:.15g} in {steps} steps", steps, t, residual)
+        return Status(StatusCode.EVENT, f"{name}: reached at t = {t:.6g} in {steps} steps", steps, t, residual)
     name = names[outcome.undefined_events[0] if outcome.undefined_events else 0]
     text = (
         f"{name} is NaN near t = {t:g} between values of opposite sign, so its zero cannot be located. Define it there"

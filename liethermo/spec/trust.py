@@ -87,7 +87,7 @@ def _load_from_file(name: str, file: Path, folder: Path) -> ModuleType:
     if name not in _spec_module_names and (
         loaded_module is not None or _exists_elsewhere(name.partition(".")[0], folder)
     ):
-        raise InputError(f"there is another module {name!r}: call {file.name} something else")
+        raise InputError(f"there is another module {name!r}. Call {file.name} something else")
     spec = importlib.util.spec_from_file_location(name, file)
     assert spec is not None
     assert spec.loader is not None

@@ -110,6 +110,7 @@ def latin_hypercube(count: int, *, seed: int, **ranges) -> Zipped:
     count : int
         Number of points.
     seed : int
+        Seed of the random numbers.
     **ranges : (low, high) or (low, high, "log")
         Range of each parameter; with "log" the logarithm is sampled evenly.
 
@@ -141,6 +142,7 @@ def sobol(count: int, *, seed: int, **ranges) -> Zipped:
     count : int
         Number of points; a power of two is best.
     seed : int
+        Seed of the random numbers.
     **ranges : (low, high) or (low, high, "log")
         As for :func:`latin_hypercube`.
 

@@ -40,6 +40,7 @@ class At:
     times : array, shape (times,)
         Increasing, within the span.
     what : {"x", "energy", "entropy", "attitude"}
+        The quantity that is measured.
     """
 
     times: Any

@@ -138,7 +138,7 @@ class StudyStore:
             content = json.loads(store_metadata.read_plain_file(root / "zarr.json"))
             assert content["attributes"]["format"] == STORE_FORMAT
         except (FileError, ValueError, KeyError, TypeError, AssertionError, RecursionError) as error:
-            raise FileError(f"{root} is a {kind}, but not the store of a study; take another name") from error
+            raise FileError(f"{root} is a {kind}, but not the store of a study. Use another name") from error
         try:
             store = cls(root, *parse_group_metadata(root, content))
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:

@@ -93,10 +93,10 @@ def audit_store(path: Any, **tolerances: float) -> Audit:
     rows = [row for _, row in worst_rows.values()]
     for name, code in STATUSES.items():
         if code not in (*SUCCESS_CODES, EMPTY_POINT_STATUS) and counts.get(code):
-            rows.append(AuditRow(f"points with status {name}", float(counts[code]), 0.0, False))
+            rows.append(AuditRow(f"points with status {name}", int(counts[code]), 0, False))
     n_failed = sum(count for code, count in counts.items() if code not in (*SUCCESS_CODES, EMPTY_POINT_STATUS))
     if not n_failed:
-        rows.append(AuditRow("points that failed", 0.0, 0.0, True))
+        rows.append(AuditRow("points that failed", 0, 0, True))
     return Audit(
         drift,
         min_entropy_increment if math.isfinite(min_entropy_increment) else math.nan,

@@ -211,10 +211,8 @@ class Study(metaclass=ListedType):
 
         Raises
         ------
-        InputError
-            If no point can be run, or the store belongs to another study.
-        FileError
-            If the store cannot be read or written, or another run works on it.
+        InputError, FileError
+            If no point can be run, the store belongs to another study, or another run works on it.
         """
         store, axes = self._open_or_create_store_and_axes()
         is_interrupted = False
@@ -285,10 +283,7 @@ class Study(metaclass=ListedType):
 
         Raises
         ------
-        FileError
-            If there is no store.
-        InputError
-            If a tolerance has an unknown name, or is negative.
+        FileError, InputError
         """
         return audit_store(self.store, **tolerances)
 
@@ -339,7 +334,7 @@ class Study(metaclass=ListedType):
         except InputError as error:
             differences = [str(error)]
         if differences:
-            head = f"{self.store} is the store of another study; take another name for this one:"
+            head = f"{self.store} is the store of another study. Use another name for this one:"
             raise InputError("\n  ".join([head, *differences]))
         return store, axes
 

@@ -46,10 +46,12 @@ class System(SystemInterface):
     Attributes
     ----------
     poisson : manifolds.PoissonStructure
+        The Poisson structure.
     energy, entropy : Energy
         Callable on states of shape (..., n), an energy that depends on time on a state and a time. ``entropy`` is None
         for a system without one.
     dissipation : Dissipation or None
+        The dissipation; None without one.
     momentum_maps : dict of Energy
         Further functions that are claimed to be conserved, by name.
     dim : int
@@ -90,7 +92,7 @@ class System(SystemInterface):
         Without ``check_poisson`` an expensive check is skipped, because Pi is a Poisson tensor by construction.
         """
         if not isinstance(baths, HeatBaths | None):
-            raise InputError(f"baths must be lt.HeatBaths(...), not {type(baths).__name__}")
+            raise InputError(f"baths must be lt.HeatBaths(...), got {type(baths).__name__}")
         self.dim, self.space = dim, space
         self.poisson = trace_callables(poisson, lambda poisson, x: poisson.sharp(x, x), (dim,))
         self.energy = checked_energy(
@@ -120,13 +122,13 @@ class System(SystemInterface):
         dissipation = sum_dissipations([term for term in terms if not drives_baths(term)] or None)
         for term in bath_terms:
             if baths is None and term.acts_on_baths_alone:
-                raise InputError(f"{type(term).__name__} acts on baths: give the system baths=lt.HeatBaths(...)")
+                raise InputError(f"{type(term).__name__} acts on baths. Give the system baths=lt.HeatBaths(...)")
             if baths is None:
                 raise InputError(f"{type(term).__name__} drives the entropy up, so the system needs an entropy")
             if not term.can_drive_baths:
                 raise InputError(
                     f"{type(term).__name__} drives the entropy of the body up, which it needs beside the entropies of "
-                    "its baths: give entropy="
+                    "its baths. Give entropy="
                 )
         self.dissipation = None
         if dissipation is not None:
@@ -163,14 +165,14 @@ class System(SystemInterface):
             The times of the states, if the temperatures depend on it.
         """
         if self.baths is None:
-            raise InputError("this system has no baths: give it baths=lt.HeatBaths(...)")
+            raise InputError("this system has no baths. Give it baths=lt.HeatBaths(...)")
         entropies, energy = jnp.asarray(x)[..., self.body_dim :], self.baths.energy
         if isinstance(self.energy, BodyBathsEnergy):  # which may be frozen at a time
             energy = self.energy.baths
         if not energy.depends_on_time:
             return jnp.vectorize(energy.gradient, signature="(m)->(m)")(entropies)
         if t is None:
-            raise InputError("the temperatures of the baths depend on time: give the time beside the state")
+            raise InputError("the temperatures of the baths depend on time. Give the time beside the state")
         gradient = jnp.vectorize(lambda y, t: energy.at_time(t).gradient(y), signature="(m),()->(m)")
         return gradient(entropies, jnp.asarray(t, dtype=jnp.float64))
 
@@ -366,7 +368,7 @@ def name_momentum_maps(given) -> dict[str, Any]:
     if isinstance(given, Mapping):
         return dict(given)
     if not isinstance(given, Sequence) or isinstance(given, str):
-        raise InputError(f"momentum_maps are a dict of functions, or a sequence of them, not {type(given).__name__}")
+        raise InputError(f"momentum_maps must be a dict or a sequence of functions, got {type(given).__name__}")
     return {getattr(J, "__name__", f"J{i + 1}"): J for i, J in enumerate(given)}
 
 

@@ -21,7 +21,7 @@ from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers
 from ..functions.energy import Energy, Sum
 from ..functions.mechanics import Each
-from ..tracing.short_form import short_form
+from ..tracing.short_form import arguments_form
 
 
 class HeatBaths(Module):
@@ -73,14 +73,17 @@ class HeatBaths(Module):
     energy: Energy
     number: int = eqx.field(static=True)
 
-    __repr__ = short_form
+    def __repr__(self) -> str:
+        if isinstance(self.energy, BathEnergy):
+            return f"HeatBaths({arguments_form(vars(self.energy))})"
+        return f"HeatBaths({arguments_form(vars(self))})"
 
     def __init__(self, capacity=1.0, temperature=1.0, number: int | None = None, energy=None):
         if number is None:
             sequences = [v for v in (capacity, temperature, energy) if isinstance(v, list | tuple) or np.ndim(v) == 1]
             number = max(map(len, sequences), default=1)
         if isinstance(number, bool) or not isinstance(number, int) or number < 1:
-            raise InputError(f"the number of baths is a positive integer, not {number!r}")
+            raise InputError(f"the number of baths must be a positive integer, got {number!r}")
         self.number = number
         if callable(energy):
             self.energy = Each(_BathEnergyFunction(energy), np.arange(number)[:, None])
@@ -102,7 +105,7 @@ class HeatBaths(Module):
         for i in driven:
             if not is_traced(C) and np.isfinite(C[i]):
                 raise InputError(
-                    f"the temperature of bath {i} is a function of the time, so its capacity must be infinite, not "
+                    f"the temperature of bath {i} is a function of the time, so its capacity must be infinite, got "
                     f"{float(C[i]):g}. Set capacity=np.inf"
                 )
         terms: list[Energy] = [
@@ -141,7 +144,7 @@ def _entries_of_baths(value, what: str, number: int) -> list:
     if not isinstance(value, list | tuple):
         return [value] * number if np.ndim(value) == 0 else list(value)
     if len(value) != number:
-        raise InputError(f"the {what} of {number} baths has an entry for each, not {len(value)} entries")
+        raise InputError(f"the {what} of {number} baths must have one entry per bath, got {len(value)}")
     return list(value)
 
 
@@ -178,10 +181,10 @@ def _check_positive(value, what: str, number: int, infinite: bool) -> jax.Array:
         array = checked_numbers(value, f"the {what} of baths")
         array = jnp.broadcast_to(array, (number,)) if array.ndim == 0 else array
     if array.shape != (number,):
-        raise InputError(f"the {what} of {number} baths is one number, or has shape ({number},), not {array.shape}")
+        raise InputError(f"the {what} of {number} baths must be a number or have shape ({number},), got {array.shape}")
     if not is_traced(array) and not all(a > 0.0 and (infinite or np.isfinite(a)) for a in array.tolist()):
         allowed = "positive" if infinite else "positive and finite"
-        raise InputError(f"the {what} of a bath must be {allowed}, not {array.tolist()}")
+        raise InputError(f"the {what} of a bath must be {allowed}, got {array.tolist()}")
     return array
 
 

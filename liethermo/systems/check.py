@@ -81,7 +81,7 @@ def check_system(
     system = system.drop_torque()
     if points is None:
         if samples < 1:
-            raise InputError(f"samples must be a positive integer, not {samples}")
+            raise InputError(f"samples must be a positive integer, got {samples}")
         points = system.samples(samples, seed, scale)
     else:
         points = np.asarray(system.state(points, batch=True))
@@ -96,7 +96,7 @@ def check_system(
     is_inside = np.isfinite(residuals["domain"])
     if not is_inside.any():
         raise InputError(
-            f"energy, entropy or dissipation is not finite at any of the {len(points)} test points: give points inside "
+            f"energy, entropy or dissipation is not finite at any of the {len(points)} test points. Give points inside "
             "their domain to system.check(points=...), and validate=False to the constructor"
         )
     rows = [
@@ -132,7 +132,7 @@ _AXIOMS = {
     "tangent": ("tangent", "Pi or K leads out of the space: what they return is not a tangent vector"),
     "classes": (
         "functions of classes",
-        "energy, entropy or a momentum map changes along the stabilizer, where all points are one: write it by what "
+        "energy, entropy or a momentum map changes along the stabilizer, where all points are one. Write it by what "
         "the stabilizer leaves alone, as the projectors of a flag are",
     ),
     "skew": ("Pi skew", "the Poisson tensor must be antisymmetric"),

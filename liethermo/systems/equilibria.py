@@ -106,6 +106,7 @@ class Equilibria(Sequence, metaclass=ListedABCMeta):
     Attributes
     ----------
     members : tuple of Equilibrium
+        The equilibria that were found.
     level_names : tuple of str
         The functions whose values are those of the reference state.
     n_starts, n_converged : int

@@ -73,6 +73,7 @@ class EulerPoincareSystem(LiePoissonSystem):
     Parameters
     ----------
     algebra : manifolds.LieAlgebra
+        The Lie algebra g of the velocities.
     lagrangian : function from xi, shape (dim,), to a scalar, or an Energy
         Its Hessian must be invertible (regular Lagrangian). It may depend on time, as a second argument.
     entropy, dissipation, momentum_maps, validate, group, reconstruction, torque
@@ -198,6 +199,7 @@ class EulerPoincareClosedSystem(LedgerSystem):
     Parameters
     ----------
     algebra : manifolds.LieAlgebra
+        The Lie algebra g of the velocities.
     lagrangian : function of (xi, S), xi of shape (dim,), to a scalar
         l, regular: ``l_xi xi`` has an inverse.
     friction : function of (xi, S), or of (xi, S, t), to a covector, shape (dim,); or a coefficient; optional
@@ -206,7 +208,7 @@ class EulerPoincareClosedSystem(LedgerSystem):
         semidefinite.
     external : function of the same arguments, or an array of shape (dim,); optional
         F, in the frame of the body.
-    heat_power : function likewise to a scalar, or a number; optional
+    heat_power : function of the same arguments to a scalar, or a number; optional
         P_H, the heat received per time (power).
     momentum_maps, validate
         As for :class:`System`; functions of (xi, S).
@@ -238,7 +240,7 @@ class EulerPoincareClosedSystem(LedgerSystem):
     ):
         if not isinstance(algebra, mf.LieAlgebra):
             raise InputError(
-                f"the algebra must be a manifolds.LieAlgebra, such as mf.so(3), not {type(algebra).__name__}"
+                f"the algebra must be a manifolds.LieAlgebra, such as mf.so(3), got {type(algebra).__name__}"
             )
         n = algebra.dim
         checked_energy(make_energy(lambda x: lagrangian(x[:n], x[n]), "the Lagrangian"), n + 1, "the Lagrangian")

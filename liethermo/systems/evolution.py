@@ -119,7 +119,7 @@ class EvolutionSystem(MomentumContactSystem):
     For ``H = lt.Kinetic(G) + lt.Potential(V)``, that is ``p . G(q) p / 2 + V(q, S)`` with G semidefinite, it holds, and
     the metriplectic schemes keep it exactly: ``S' - S = h sum b_i p_i . G p_i >= 0`` at every step, for every V and h
     (not with the coordinate increment as printed, unless G is diagonal). Where the same H is written as one
-    plain function, they keep the energy exactly too, but the entropy may fall at a coarse step.
+    plain function, they conserve the energy exactly too, but the entropy may fall at a coarse step.
 
     Q is R^n, or a ``space``. There a state has the arrays of q and p in one row, and S behind them. The array p is that
     along Q which acts on velocities as the momentum does, ``sum(p * v)``. What energies are off Q counts for nothing.
@@ -209,7 +209,7 @@ def configuration_space(contact: mf.SplitContact) -> mf.Space | None:
 def check_space(space) -> mf.Space:
     """Return the space of positions, or raise an InputError if it is no space."""
     if not isinstance(space, mf.Space):
-        raise InputError(f"space must be a manifolds.Space, such as mf.Sphere(2), not {type(space).__name__}")
+        raise InputError(f"space must be a manifolds.Space, such as mf.Sphere(2), got {type(space).__name__}")
     return space
 
 
@@ -218,7 +218,7 @@ def state_dim(dim: int | None, space: mf.Space | None) -> int:
     if space is None:
         return 2 * n_degrees_of_freedom(dim) + 1
     if dim not in (None, n := 2 * check_space(space).size + 1):
-        raise InputError(f"on {space.name} a state (q, p, S) has {n} components, not {dim}: leave dim out")
+        raise InputError(f"on {space.name} a state (q, p, S) must have {n} components, got dim={dim}. Leave dim out")
     return n
 
 
@@ -245,7 +245,7 @@ def n_degrees_of_freedom(dim: int | None) -> int:
     """Return n for a state with dim = 2n + 1 components (q, p, S)."""
     if isinstance(dim, bool) or not isinstance(dim, int) or dim < 3 or dim % 2 == 0:
         raise InputError(
-            f"dim counts the components of a state (q, p, S): 2n + 1 for n degrees of freedom, 3 at least, not {dim!r}"
+            f"dim, the number of components of (q, p, S), must be 2n + 1 for n degrees of freedom, got {dim!r}"
         )
     return dim // 2
 

@@ -109,7 +109,7 @@ def _energy_of_terms(terms: Sequence, times) -> tuple[int, Energy]:
             continue
         value = _value_at_time(f, TEST_TIMES[0], f"the second of term {i} of the Hamiltonian")
         if np.shape(value) or jnp.result_type(value).kind not in "fiu":
-            raise InputError(f"the function of term {i} of the Hamiltonian gives a real number, not {value!r}")
+            raise InputError(f"the function of term {i} of the Hamiltonian must return a real number, got {value!r}")
         modulated.append(H)
         functions.append(f)
     if times is not None and not any(isinstance(f, ContinuedSpline) for f in functions):

@@ -56,7 +56,7 @@ class VelocityContactSystem(ContactManifoldSystem):
         if dim is None and space is None and isinstance(L, Quadratic):
             dim = L.A.shape[0]
         if dim is None and space is None:
-            raise InputError("the dimension of the state (q, v, S) is not known: give dim=2n+1 beside the Lagrangian")
+            raise InputError("the dimension of the state (q, v, S) is not known. Give dim=2n+1 beside the Lagrangian")
         dim = state_dim(dim, space)
         n = n_degrees_of_freedom(dim)
         self.lagrangian = L = with_polynomial_degrees(checked_energy(L, dim, "the Lagrangian"), dim)
@@ -67,8 +67,8 @@ class VelocityContactSystem(ContactManifoldSystem):
     def _hamiltonian(self) -> Energy:
         if self.configurations is not None:
             raise InputError(
-                f"the Legendre transform is inverted on R^n alone, and positions are in {self.configurations.name}: "
-                "give lt.EvolutionSystem or lt.ContactSystem the Hamiltonian, with space="
+                f"the Legendre transform is inverted on R^n alone, and positions are in {self.configurations.name}. "
+                "Give lt.EvolutionSystem or lt.ContactSystem the Hamiltonian, with space="
             )
         return _legendre_hamiltonian(self.lagrangian, self.dim)
 

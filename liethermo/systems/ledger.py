@@ -246,10 +246,10 @@ def linear_friction(coefficient, n: int, what: str) -> LinearFriction:
     R = checked_numbers(coefficient, what)
     R = jnp.full(n, R) if R.ndim == 0 else R
     if R.shape not in ((n,), (n, n)):
-        raise InputError(f"{what} has shape (), ({n},) or ({n}, {n}), not {R.shape}")
+        raise InputError(f"{what} must have shape (), ({n},) or ({n}, {n}), got {R.shape}")
     if R.ndim == 2:
         return LinearFriction(checked_semidefinite(R, what, symmetric=False))
-    require_condition(R.min(), lambda r: r >= 0.0, f"{what} must be >= 0, not {{value:g}}: it would inject energy")
+    require_condition(R.min(), lambda r: r >= 0.0, f"{what} must be >= 0, got {{value:g}}; friction cannot add energy")
     return LinearFriction(R)
 
 

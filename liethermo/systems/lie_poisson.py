@@ -51,7 +51,7 @@ class LiePoissonSystem(TorqueSystem):
     energy : function from mu, shape ``algebra.shape``, to a scalar, or an Energy
         H, or a function of mu and the time t: see :class:`liethermo.TimeDependent`. It fixes the units: that of H over
         that of mu is 1 / time.
-    entropy : likewise, optional
+    entropy : function from mu to a scalar, or an Energy; optional
         S, a Casimir function of the algebra (checked), in any unit of entropy, or dimensionless.
     dissipation : Dissipation, or a list of them that act together; optional
         The part of the motion that produces entropy or lowers the energy.
@@ -65,34 +65,22 @@ class LiePoissonSystem(TorqueSystem):
         ``g' = g hat(xi)``. Here xi is :meth:`transport`: the gradient of H, and the velocity that internal friction
         adds. The momentum in space is ``Ad_star(inverse(g), mu)``, and it is constant if no torque acts.
     reconstruction : {"coadjoint", "cayley", "exp"}, optional
-        The map of the attitude. The default keeps the spatial momentum of a free body, if the group has such a map;
-        else it is Cayley's map, if that stays in the group. ``"exp"`` stays in every
-        group, and keeps the spatial momentum to the order of the method.
+        The map of the attitude. The default conserves the spatial momentum of a free body, if the group has such a
+        map; otherwise it is Cayley's map, or ``"exp"``, which stays in every group.
     baths : HeatBaths, optional
-        The baths that take the heat of a dissipation that lowers the energy (energy of H, entropies in energy /
-        temperature). A state is then mu, in one row, followed by the entropies of the baths. If these are left out of
-        a state, they are zero.
+        The baths that take the heat of a dissipation that lowers the energy. A state is then mu, in one row, followed
+        by the entropies of the baths (energy / temperature), which are zero if they are left out.
     torque : function of (t, mu), (t, mu, attitude) or (t, mu, attitude, velocity), or a list of them; optional
         An external torque, ``mu' = ad*_xi mu + torque``: a dual vector of the shape of mu (energy, if xi is 1 / time).
         The attitude has shape (m, m); the velocity is ``dH/dmu``, of the shape of mu, for torques such as drag.
-        It does the work W, ``W' = xi . torque``, and the energy less the work is constant. With a group it also has an
-        impulse, the momentum in space that it has transferred. The arrays of an ``equinox.Module`` are parameters,
-        such as ``"torque.moment"``. With a torque, Casimirs are not constant, and momentum maps must be conserved by
-        the torque too. ``lt.torques`` has ready ones.
-
-    Attributes
-    ----------
-    torque_arguments : (t, attitude) or None
-        Where a torque is taken: see :meth:`at_time`.
+        The torque does the work W, ``W' = xi . torque``; the energy less the work is constant, the Casimirs are not.
+        Momentum maps must be conserved by the torque too. The arrays of an ``equinox.Module`` are parameters, such as
+        ``"torque.moment"``. ``lt.torques`` has ready ones.
 
     Raises
     ------
-    CasimirError
-        If the entropy is not a Casimir.
-    IndefiniteError, AxiomError, FunctionError, InputError
-        If the dissipation, a function or the group does not fit.
-    manifolds.LieAlgebraError
-        If the reconstruction asked for leaves the group.
+    CasimirError, IndefiniteError, AxiomError, FunctionError, InputError, manifolds.LieAlgebraError
+        If the entropy is not a Casimir, or the dissipation, a function, the group or its reconstruction does not fit.
 
     Examples
     --------
@@ -171,28 +159,22 @@ class LiePoissonSystem(TorqueSystem):
     def state(
         self, x=None, batch: bool = False, *, angular_velocity=None, rotor_rates=None, temperature=None, t=None
     ) -> jax.Array:
-        """Return a state of this system: ``x``, checked, or that of a rigid body with a given angular velocity.
+        """Return ``x`` as a checked state, or the state of a rigid body with a given angular velocity.
 
         Parameters
         ----------
         x : array, shape (n,), or (..., n) with ``batch``; optional
-            See :meth:`System.state`.
+            A state, which is checked.
         batch : bool
             Whether leading axes are several states.
         angular_velocity : array, shape (3,), or (..., 3) with ``batch``; optional
             Omega in body axes (rad / time), instead of x. The momentum is the one at which ``dH/dmu = (Omega, w)``.
         rotor_rates : array, shape (k,), or (..., k) with ``batch``; optional
-            w, the rates of rotors relative to the body (rad / time), or the other velocities of the algebra; zero by
-            default.
+            w, the rates of rotors relative to the body (rad / time), or other velocities; zero by default.
         temperature : float, or array, shape (baths,); optional
             Temperatures of the baths; by default those at zero entropy.
         t : float, optional
             The time, if the energy depends on it.
-
-        Raises
-        ------
-        InputError
-            If neither or both of x and the angular velocity are given, or no state has these values.
 
         Examples
         --------

@@ -274,6 +274,7 @@ class Linearisation:
         Number of directions that these functions take out. It is smaller than their number if their gradients are
         linearly dependent, as those of the energy and the Casimirs at an equilibrium of a Lie-Poisson system.
     stability : Stability
+        The verdict on the equilibrium.
     eigenvalue_errors : array, shape (p,)
         Bounds of the rounding error of the eigenvalues; a rate below its bound counts as zero.
     """

@@ -84,18 +84,18 @@ class MetriplecticSystem(System):
             space = mf.GroupSpace(space) if isinstance(space, mf.MatrixGroup) else space
             if not isinstance(space, mf.Space):
                 raise InputError(
-                    f"the space must be a manifolds.Space, such as manifolds.Sphere(2), not {type(space).__name__}; "
+                    f"the space must be a manifolds.Space, such as manifolds.Sphere(2), got {type(space).__name__}; "
                     "for a manifold of geomstats give manifolds.from_geomstats(...)"
                 )
             dim = space.size if dim is None else dim
         if dim is None and (poisson is None or (callable(poisson) and not isinstance(poisson, mf.PoissonStructure))):
             raise InputError(
-                "the dimension of the state is not known: give dim=n beside a Poisson tensor that is a function or None"
+                "the dimension of the state is not known. Give dim=n beside a Poisson tensor that is a function or None"
             )
         if not isinstance(poisson, mf.PoissonStructure):
             poisson = mf.PoissonTensor(poisson, dim) if poisson is not None else mf.NoPoisson(dim)  # type: ignore[arg-type]
         if poisson.dim is None:
-            raise InputError("the Poisson structure does not say how many coordinates it has: give it its dimension")
+            raise InputError("the Poisson structure does not say how many coordinates it has. Give it its dimension")
         if space is not None and poisson.dim != space.size:
             raise InputError(
                 f"the Poisson structure has {poisson.dim} coordinates, but a point of {space.name} has {space.size} "

@@ -129,7 +129,7 @@ class QuantumSystem(System):
         times=None,
     ):
         if not isinstance(baths, HeatBaths | None):
-            raise InputError(f"baths must be lt.HeatBaths(...), not {type(baths).__name__}")
+            raise InputError(f"baths must be lt.HeatBaths(...), got {type(baths).__name__}")
         self.time = None
         size, energy = hamiltonian_energy(hamiltonian, times)
         self.structure = structure = mf.DensityMatrices(size)
@@ -137,7 +137,7 @@ class QuantumSystem(System):
         entropy = VonNeumann() if entropy is None else entropy
         if not isinstance(entropy, VonNeumann):
             raise InputError(
-                f"the entropy of a density matrix must be lt.VonNeumann(...), not {type(entropy).__name__}"
+                f"the entropy of a density matrix must be lt.VonNeumann(...), got {type(entropy).__name__}"
             )
         self.floor = entropy.floor
         terms = _checked_terms(dissipation)
@@ -204,7 +204,7 @@ class QuantumSystem(System):
         front, m = matrices.shape[:-2], self.dim - self.body_dim
         y = np.zeros((*front, m)) if entropies is None else np.asarray(entropies, dtype=np.float64)
         if y.shape[-1:] != (m,):
-            raise InputError(f"the entropies of {m} baths have shape (..., {m}), not {y.shape}")
+            raise InputError(f"the entropies of {m} baths must have shape (..., {m}), got {y.shape}")
         x = np.asarray(self.structure.vector(matrices))
         return jnp.asarray(np.concatenate([x, np.broadcast_to(y, (*front, m))], axis=-1))
 
@@ -236,7 +236,7 @@ class QuantumSystem(System):
         """Return the density matrices, shape (..., N, N), of states, shape (..., n)."""
         x = jnp.asarray(x)
         if x.shape[-1:] not in ((self.dim,), (self.body_dim,)):
-            raise InputError(f"a state of this system has shape (..., {self.dim}), not {x.shape}")
+            raise InputError(f"a state of this system must have shape (..., {self.dim}), got {x.shape}")
         return self.structure.matrix(x[..., : self.body_dim])
 
     def reduced(self, x, part: int | str) -> jax.Array:
@@ -251,7 +251,7 @@ class QuantumSystem(System):
         k = self.names.index(part) if part in self.names else part
         if isinstance(k, bool) or not isinstance(k, int) or not 0 <= k < len(self.parts):
             raise InputError(
-                f"the parts are 0 to {len(self.parts) - 1}, or {self.names or 'without names'}, not {part!r}"
+                f"part must be 0 to {len(self.parts) - 1}, or one of the names {self.names or '()'}, got {part!r}"
             )
         n_before, n_part = math.prod(self.parts[:k]), self.parts[k]
         rho = self.density(x)
@@ -341,19 +341,21 @@ class QuantumSystem(System):
         kernels = self._kernels(rho)
         use = [i for i, kernel in enumerate(kernels) if kernel.size]
         turned = [self._is_kernel_rotated(rho[i], kernels[i]) for i in use]
-        mix = "mix it, as in q.state(rho, mixed=1e-6)"
+        mix = "Use system.state(rho, mixed=1e-6)"
         if self.floor > 0.0:
-            text = "eigenvalues of its density matrix are zero, and the Hamiltonian turns their eigenvectors: the ends "
-            text += f"of steps have others, by the error of a step, which steepest ascent lets grow: {mix}"
+            text = (
+                "its density matrix has zero eigenvalues whose eigenvectors the Hamiltonian turns, so steepest ascent "
+            )
+            text += f"would amplify the error of a step. {mix}"
             return text if any(turned) else ""
         grows = [self._equilibrium_population(x[i], kernels[i]) > self._zero_eigenvalue_limit for i in use]
         if not any(grows):
             return ""
         first = grows.index(True)
-        floor = ", or give the system entropy=lt.VonNeumann(floor=1e-12), which leaves this eigenvalue at zero"
+        floor = ", or give the system entropy=lt.VonNeumann(floor=1e-12), which keeps this eigenvalue at zero"
         return (
             f"its density matrix has the eigenvalue {np.linalg.eigvalsh(rho[use[first]])[0]:.3g}, where the gradient "
-            f"of the entropy is infinite: {mix}{'' if turned[first] else floor}"
+            f"of the entropy is infinite. {mix}{'' if turned[first] else floor}"
         )
 
     def _is_kernel_rotated(self, rho: np.ndarray, kernel: np.ndarray) -> bool:
@@ -390,10 +392,12 @@ class QuantumSystem(System):
         if not grows.size:
             return ""
         eigenvalue = np.linalg.eigvalsh(rho[use[grows[0]]])[0]
-        otherwise = ", or take lt.MetriplecticRungeKutta, whose stages are without it" if has_generator(self) else ""
+        otherwise = (
+            ", or lt.MetriplecticRungeKutta, which does not evaluate this gradient" if has_generator(self) else ""
+        )
         return (
-            f"its density matrix has the eigenvalue {eigenvalue:.3g}, which jumps make larger, where the gradient of "
-            f"the entropy is infinite: mix it, as in q.state(rho, mixed=1e-6){otherwise}"
+            f"its density matrix has the eigenvalue {eigenvalue:.3g}, where the gradient of the entropy is infinite, "
+            f"and jumps move the state off it. Use system.state(rho, mixed=1e-6){otherwise}"
         )
 
     def _jump_rates(self, x: np.ndarray, kernels: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -449,7 +453,7 @@ class QuantumSystem(System):
             The time, if the Hamiltonian depends on it.
         """
         if self.baths is None:
-            raise InputError("this system has no baths: give it baths=lt.HeatBaths(...) and lt.ThermalJumps")
+            raise InputError("this system has no baths. Give it baths=lt.HeatBaths(...) and lt.ThermalJumps")
         return -self.temperatures(x, t) * self.vector_field(x, t)[..., self.body_dim :]
 
     def entropy_production(self, x, t=None) -> jax.Array:
@@ -545,14 +549,14 @@ class QuantumSystem(System):
             for term in s.total_dissipation.terms:
                 if not isinstance(term, ThermalJumps):
                     raise InputError(
-                        f"{type(term).__name__} of a part is none of a product: give it to the product as a whole"
+                        f"{type(term).__name__} of a part is none of a product. Give it to the product as a whole"
                     )
                 operators = [tensor_with_identity(np.asarray(V), k, sizes) for V in term.operators]
                 terms.append(term.replace_operators(operators, term.bath + offset))
             offset += s.dim - s.body_dim
         if (self.baths is None) != (other.baths is None) and all(s.total_dissipation.terms for s in systems):
             raise InputError(
-                "the jumps of one part have a bath, but those of the other none: give baths to both parts or to neither"
+                "the jumps of one part have a bath, but those of the other none. Give baths to both parts or to neither"
             )
         H = [s._constant_hamiltonian() for s in systems]
         total_H = tensor_with_identity(H[0], 0, sizes) + tensor_with_identity(H[1], 1, sizes)
@@ -585,8 +589,8 @@ def _checked_terms(dissipation) -> tuple[Dissipation, ...]:
     for term in terms:
         if not isinstance(term, ThermalJumps | SteepestEntropyAscent | LindbladJumps):
             raise InputError(
-                f"the dissipation of density matrices is lt.ThermalJumps or lt.SteepestEntropyAscent, or "
-                f"lt.LindbladJumps without these laws, not {type(term).__name__}"
+                "the dissipation of a density matrix must be lt.ThermalJumps, lt.SteepestEntropyAscent or "
+                f"lt.LindbladJumps, got {type(term).__name__}"
             )
     return terms
 

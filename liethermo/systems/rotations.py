@@ -63,6 +63,7 @@ def attitude(
     matrix : array, shape (..., 3, 3), optional
         Rotation matrices.
     rotation : scipy.spatial.transform.Rotation, optional
+        The attitude, as SciPy represents it.
 
     Returns
     -------
@@ -186,7 +187,7 @@ def _matrices_of_quaternions(quaternion, scalar: str) -> np.ndarray | jax.Array:
         distance = float(np.abs(norm - 1.0).max(initial=0.0))
         if not distance <= SINGLE_PRECISION_TOLERANCE:
             worst_norm = float(norm.flat[int(np.argmax(np.abs(np.ravel(norm) - 1.0)))])
-            raise InputError(f"a quaternion must have norm 1, got {worst_norm:.6g}: give q / np.linalg.norm(q)")
+            raise InputError(f"a quaternion must have norm 1, got {worst_norm:.6g}. Give q / np.linalg.norm(q)")
         if distance > ROTATION_TOLERANCE:
             _warn_of_single_precision(distance, "the norm of the quaternion")
     xp: Any = jnp if is_traced(q) else np

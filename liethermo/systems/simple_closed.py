@@ -54,11 +54,12 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
     friction : function of (q, v, S) or (q, v, S, t), to shape (n,); or a coefficient; optional
         F_fr, with ``F_fr . v <= 0`` (force). A coefficient R means ``F_fr = -R v``: a number, an array of shape (n,)
         for a diagonal matrix, or (n, n), whose symmetric part is positive semidefinite (mass / time).
-    external : function likewise, or an array of shape (n,); optional
+    external : function of (q, v, S) or (q, v, S, t), to shape (n,); or an array of shape (n,); optional
         F_ext (force).
-    heat_power : function likewise to a scalar, or a number; optional
+    heat_power : function of (q, v, S) or (q, v, S, t), to a scalar; or a number; optional
         P_H, the heat received per time (power).
     momentum_maps : dict of functions, or a sequence of them
+        Conserved quantities of a symmetry, functions of the state.
     validate : bool
         Test the axioms at a few random points, that friction brakes among them. Turn off where a function is not
         defined at normally distributed points, and use ``system.check(points=...)``.
@@ -186,7 +187,7 @@ class ChetaevSystem(SimpleClosedSystem):
     For ``eta = dS - L_v dq`` this is :class:`liethermo.ThermodynamicHerglotz` [SML Prop. 3.3], and for
     ``eta = T dS + F_fr dq`` a :class:`liethermo.SimpleClosedSystem` with the friction F_fr.
 
-    The metriplectic schemes keep the energy, and the sign of S' in each step, exactly.
+    The metriplectic schemes conserve the energy exactly, and S' >= 0 holds exactly in each step.
     :class:`liethermo.VariationalIntegrator` discretises the principle itself: D_1 L_d + D_2 L_d is a multiple of eta at
     the points of its finite difference maps, on which eta vanishes.
 
@@ -246,7 +247,7 @@ class SemibasicForm(Module):
     def from_function(cls, eta, shape: tuple[int, ...]) -> SemibasicForm:
         """Return the checked form of a user's function, for q and v of a shape."""
         if not callable(eta):
-            raise InputError(f"eta is a function of (q, v, S) to the components of a one-form, not {eta!r}")
+            raise InputError(f"eta must be a function of (q, v, S) that returns a one-form, got {eta!r}")
         is_implicit, n = required_argument_count(eta) == 4, math.prod(shape)
         function = eta if is_implicit else LastArgumentIgnored(eta)
         function = function if len(shape) == 1 else FlattenedFunction(function, shape)

@@ -62,15 +62,19 @@ class SpinSystem(TorqueSystem):
     Parameters
     ----------
     sites : int or tuple of int
+        Number of spins, or the shape of their lattice.
     energy : Energy or function from s, shape ``(*sites, 3)``, to a scalar
         Such as a sum of the terms in ``lt.magnetism``. May depend on time.
     dissipation : LandauLifshitz, or a list of dissipations that act together; optional
+        The damping; without it the spins precess only.
     baths : HeatBaths, optional
+        The baths that take the heat of the damping.
     ratio : float, or array of the shape of the sites
         gamma_i.
     momentum_maps : dict of functions, or a sequence of them
         Of s, shape ``(*sites, 3)``.
     validate : bool
+        Test the axioms at a few random points.
     torque : function w of t, shape (), and s, shape ``(*sites, 3)``; or a list of them; optional
         Torques ``s x w`` (w in 1 / time) from outside, such as ``lt.magnetism.Slonczewski``. Each |s_i| stays constant.
         The torque does the work W, ``W' = sum grad_i H . (s_i x w_i)``, and the energy less the work is constant.
@@ -230,7 +234,7 @@ class SpinSystem(TorqueSystem):
             temperature = np.asarray(parts.heating.values_at_sites(gradient[n:]))
             diffusion = float((2.0 * boltzmann * np.abs(temperature) * rate).max())
         if not (turning_rate > 0.0 or diffusion > 0.0):
-            raise InputError("no spin turns at this state, so any step will do: give a state away from rest")
+            raise InputError("no spin turns at this state, so any step will do. Give a state away from rest")
         return min(angle / turning_rate if turning_rate else np.inf, angle**2 / diffusion if diffusion else np.inf)
 
     def state_array(self, x, batch: bool = False):
@@ -240,7 +244,7 @@ class SpinSystem(TorqueSystem):
             x = (x if isinstance(x, jax.Array) else np.asarray(x)).reshape(*x_shape[: -len(shape)], -1)
         elif x_shape[-1:] not in ((self.dim,), (self.body_dim,)):
             raise InputError(
-                f"a state has its spins in shape {shape}, or all {self.dim} components in one row, not shape {x_shape}"
+                f"a state must have shape {shape}, or ({self.dim},) with all components in one row, got {x_shape}"
             )
         return super().state_array(x, batch)
 
@@ -323,10 +327,10 @@ def _checked_powers(power, baths: HeatBaths | None) -> tuple[tuple[int, ...], tu
     if power is None:
         return (), ()
     if not isinstance(baths, HeatBaths):
-        raise InputError("power= heats baths, and there are none: give baths=lt.HeatBaths(...)")
+        raise InputError("power= heats baths, and there are none. Give baths=lt.HeatBaths(...)")
     entries = list(power) if isinstance(power, list | tuple) else [power, *[None] * (baths.number - 1)]
     if len(entries) != baths.number:
-        raise InputError(f"the power of {baths.number} baths has an entry for each, not {len(entries)} entries")
+        raise InputError(f"power must have {baths.number} entries, one per bath, got {len(entries)}")
     for i, entry in enumerate(entries):
         if not callable(entry) and entry is not None:
             raise InputError(

@@ -24,7 +24,7 @@ def checked_state_array(system: Any, x, batch: bool = False) -> np.ndarray | jax
         except (TypeError, ValueError) as error:
             raise InputError(f"a state is a rectangular array of real numbers: {error}") from None
         if x.dtype.kind not in "fiubc":
-            raise InputError(f"a state is an array of real numbers, not of {x.dtype}")
+            raise InputError(f"a state must be an array of real numbers, got {x.dtype}")
     if system.space is not None and x.shape[-len(system.space.shape) :] == system.space.shape:
         x = system.space.to_vector(x)
     if system.sites and x.shape[-len(system.shape) :] == system.shape:
@@ -32,13 +32,13 @@ def checked_state_array(system: Any, x, batch: bool = False) -> np.ndarray | jax
     if system.baths is not None and x.shape[-1:] != (system.dim,):
         x = _append_bath_entropies(system, x)
     if jnp.iscomplexobj(x):
-        raise InputError(f"a state is real, not {x.dtype}; take the real part if that is meant")
+        raise InputError(f"a state must be real, got {x.dtype}. Take its real part if that is meant")
     if x.shape[-1:] != (system.dim,) or (x.ndim > 1 and not batch):
         expected = f"(..., {system.dim})" if batch else f"({system.dim},)"
         if system.sites:
             shown = ", ".join([*(["..."] if batch else []), *map(str, system.shape)])
             expected = f"({shown}), or flat {expected}"
-        raise InputError(f"a state of this system has shape {expected}, not {x.shape}")
+        raise InputError(f"a state of this system must have shape {expected}, got {x.shape}")
     if isinstance(x, jax.core.Tracer):
         return x
     numbers = np.asarray(x, dtype=np.float64)
@@ -85,7 +85,7 @@ def evaluate_batch(system: Any, function: Callable, x, t, result_signature: str)
         return jnp.vectorize(lambda y: function(system, y), signature=f"(n)->{result_signature}")(x)
     if t is None:
         what = "energy of this system depends on" if system.energy.depends_on_time else "torque is known at a"
-        raise InputError(f"the {what} time: give the time beside the state")
+        raise InputError(f"the {what} time. Give the time beside the state")
     evaluate = jnp.vectorize(lambda y, t: function(system.at_time(t), y), signature=f"(n),()->{result_signature}")
     return evaluate(x, jnp.asarray(t, dtype=jnp.float64))
 

@@ -65,7 +65,7 @@ class TorqueSystem(System):
         if t is None or (attitude is None and laws.needs_attitude):
             what = "time and the attitude" if laws.needs_attitude else "time"
             raise InputError(
-                f"the torque {laws.name} is known at a {what}: take system.at_time(t"
+                f"the torque {laws.name} is known at a {what}. Use system.at_time(t"
                 f"{', attitude' if laws.needs_attitude else ''})"
             )
         torque = self._torque_at(x, t, attitude)
@@ -106,7 +106,7 @@ def traced_torque_and_argument_counts(
         name = torque_name(
             next(term for term, n in zip(terms, counts, strict=True) if n > MAX_ARGUMENTS_WITHOUT_ATTITUDE)
         )
-        raise InputError(f"the torque {name} depends on the attitude: give the system a group, such as group=mf.SO(3)")
+        raise InputError(f"the torque {name} depends on the attitude. Give the system a group, such as group=mf.SO(3)")
     shapes = _argument_shapes(algebra, group)
 
     def evaluate_terms(torque, t, mu, velocity, *g):
@@ -126,7 +126,7 @@ def traced_torque_and_argument_counts(
         if (value.shape != algebra.shape and not acts_on_body) or not jnp.issubdtype(value.dtype, jnp.floating):
             raise FunctionError(
                 f"the torque {torque_name(term)} must return real numbers of shape {algebra.shape}, as the momentum "
-                f"has, not {value.dtype} of shape {value.shape}"
+                f"has, got {value.dtype} of shape {value.shape}"
             )
     return torque, counts
 
@@ -207,13 +207,11 @@ MAX_ARGUMENTS = 4
 def _checked_argument_count(term: Any) -> int:
     if not callable(term):
         raise InputError(
-            "a torque is a function of t, of t and mu, or of t, mu and the attitude, such as "
-            f"lt.torques.ConstantInBody([0.0, 0.0, 1.0]), not {type(term).__name__}"
+            "a torque must be a function of t, of (t, mu) or of (t, mu, attitude), such as "
+            f"lt.torques.ConstantInBody([0.0, 0.0, 1.0]), got {type(term).__name__}"
         )
     if is_spline(term):
-        raise InputError(
-            f"a spline is a table of a torque: write lt.torques.Tabulated(spline), not {torque_name(term)}"
-        )
+        raise InputError("a spline needs a wrapper as a torque. Use lt.torques.Tabulated(spline)")
     count = len(term.program.argument_avals) if isinstance(term, TracedFunction) else required_argument_count(term)
     if count is None or not 1 <= count <= MAX_ARGUMENTS:
         raise InputError(

@@ -65,12 +65,15 @@ def check_equilibrium(
     Parameters
     ----------
     system : System
+        The system to test.
     noise : Fluctuations
+        The noise to test.
     x0 : array, shape (n,), or (paths, n)
         Initial states of the paths, all on one level.
     time, step : float
         The time has to be several relaxation times.
     paths : int
+        Number of paths.
     moments : dict of functions from a state to a number, optional
         By default the components, their squares, and the entropy or the energy.
     samples : Samples, optional
@@ -92,7 +95,7 @@ def check_equilibrium(
     for check in report.rows:
         suite.rows.append(check)
         if check.axiom == MEASURE_ROW and check.residual > check.tolerance and samples is None:
-            raise ValueError(f"the motion does not keep volume, so the measure is not known: give a density\n{report}")
+            raise ValueError(f"the motion does not keep volume, so the measure is not known. Give a density\n{report}")
     starts = np.broadcast_to(np.atleast_2d(np.asarray(x0, dtype=float)), (paths, system.dim))
     save_every = max(1, round(time / step / (2 * N_AVERAGED_STATES)))
     path_ensemble = ensemble(
@@ -112,7 +115,7 @@ def check_equilibrium(
     weights = np.asarray(exact_samples.weights) / np.sum(exact_samples.weights)
     effective_count = 1.0 / np.sum(weights**2)
     if effective_count < MIN_EFFECTIVE_SAMPLES:
-        raise ValueError(f"the points of the exact measure count as {effective_count:.0f} alone: give samples of it")
+        raise ValueError(f"the points of the exact measure count as {effective_count:.0f} alone. Give samples of it")
     for name, f in (_default_moments(system) if moments is None else moments).items():
         function = make_energy(f, f"moment {name!r}")
         path_means = (
@@ -155,7 +158,7 @@ def sample_exact_measure(system: System, noise: Fluctuations, x0, path_states: n
     invariants |= {name: system.functions()[name] for name in sorted(system.first_integrals()) if is_invariant[name]}
     if len(invariants) > 1:
         raise ValueError(
-            f"motion and noise keep {', '.join(invariants)}: for more than one give samples of the measure"
+            f"motion and noise conserve {', '.join(invariants)}. If there are several, give samples of the measure"
         )
     random, n = np.random.default_rng(seed), system.dim
     directions = random.standard_normal((N_EXACT_SAMPLES, n))
@@ -171,7 +174,7 @@ def sample_exact_measure(system: System, noise: Fluctuations, x0, path_states: n
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True) @ level_shape.T
     radius, slope = evaluate_at_points(_level_distance_and_slope, (F, level), directions).T
     if not (np.isfinite(radius) & (slope > 0.0)).all():
-        raise ValueError(f"rays from the origin do not meet the level of {name} once: give samples of the measure")
+        raise ValueError(f"rays from the origin do not meet the level of {name} once. Give samples of the measure")
     points = radius[:, None] * directions
     logs = _log_density(system, noise, points) + (n - 1) * np.log(radius) - np.log(slope)
     return Samples(points, np.exp(logs - logs.max()))

@@ -267,6 +267,7 @@ def check_relations(
     Parameters
     ----------
     system : System
+        The system to test.
     method : OneStepMethod, optional
         ``MetriplecticGauss(1)`` by default.
     x0 : array, optional

@@ -55,7 +55,7 @@ def random_start(system: System, seed: int) -> np.ndarray:
     for x in system.samples(20, seed):
         if not system.domain.why_outside(jnp.asarray(x)) and np.isfinite(_field_at_time_zero(system, x)).all():
             return np.asarray(x)
-    raise ValueError(f"none of 20 random states is inside the domain of this {system.kind}: give x0")
+    raise ValueError(f"none of 20 random states is inside the domain of this {system.kind}. Give x0")
 
 
 def default_step(system: System, x0) -> float:
@@ -226,11 +226,13 @@ def check_system(
     Parameters
     ----------
     system : System
+        The system to test.
     x0 : array, optional
         Initial state of the runs; a random one by default.
     step : float, optional
         By default a step moves the state by a hundredth of its norm.
     methods : sequence of OneStepMethod
+        The methods that are tried on it.
 
     Raises
     ------
@@ -300,7 +302,7 @@ def check_dissipation(dissipation: Dissipation | System, algebra: mf.LieAlgebra 
 def _test_system(dissipation: Dissipation, g: mf.LieAlgebra) -> LiePoissonSystem:
     quadratic = g.casimirs(2)
     if not quadratic:
-        raise ValueError(f"{g.name} has no quadratic Casimir: give a system that has the dissipation")
+        raise ValueError(f"{g.name} has no quadratic Casimir. Give a system that has the dissipation")
     weights = np.linspace(1.0, 2.0, g.dim)
 
     def energy(mu):
@@ -320,6 +322,7 @@ def check_method(method: OneStepMethod, systems: Mapping[str, Problem] | None = 
     Parameters
     ----------
     method : OneStepMethod
+        The method to test.
     systems : dict of (system, x0, time), optional
         Test problems. By default a body and a semidirect product with non-quadratic energies, and an oscillator in R^n;
         for a method for one kind of system, the matching ones of :func:`problems_for`.

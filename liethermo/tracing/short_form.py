@@ -30,8 +30,8 @@ WRAPPED_FIELDS = frozenset({"part", "term"})
 def short_form(value: Any, depth: int = 0) -> str:
     """Return one line about a value: numbers with four digits, functions by name, objects by class and fields.
 
-    Fields that are None, empty, zero or flags are left out. An array of many numbers is shown by its shape, a wrapper
-    by the object that it wraps, and a sum by its parts.
+    Fields that are None, empty, zero, flags or declared with ``repr=False`` are left out. An array of many numbers is
+    shown by its shape, a wrapper by the object that it wraps, and a sum by its parts.
     """
     if isinstance(value, jax.core.Tracer):
         return f"{value.dtype}{list(value.shape)}"
@@ -56,7 +56,7 @@ def short_form(value: Any, depth: int = 0) -> str:
 def _numbers_form(values: Any) -> str:
     if isinstance(values, list):
         return f"[{', '.join(map(_numbers_form, values))}]"
-    return str(values) if isinstance(values, bool) else f"{values:.4g}"
+    return str(values) if isinstance(values, bool) else f"{values + 0.0:.4g}"  # without the sign of -0.0
 
 
 def arguments_form(arguments: Mapping[str, Any], depth: int = 1) -> str:
@@ -72,7 +72,8 @@ def callable_with_name(value: Any) -> bool:
 def _short_form_of_object(value: eqx.Module, depth: int) -> str:
     if type(value).__repr__ not in (eqx.Module.__repr__, short_form):
         return repr(value)
-    fields = {field.name: vars(value)[field.name] for field in dataclasses.fields(value) if field.name in vars(value)}
+    shown_fields = [field.name for field in dataclasses.fields(value) if field.repr and field.name in vars(value)]
+    fields = {name: vars(value)[name] for name in shown_fields}
     for name in SUM_FIELDS & fields.keys():
         return join_shown((short_form(part, depth + 1) for part in fields[name]), ("", ""), " + ")
     for name in WRAPPED_FIELDS & fields.keys():

@@ -27,7 +27,7 @@ def checked_constants(values) -> np.ndarray:
     if array.ndim != 3 or len(set(array.shape)) != 1 or array.shape[0] == 0:
         raise ShapeError(f"structure constants must have shape (dim, dim, dim), got {array.shape}")
     if np.iscomplexobj(numeric):
-        raise ComponentError("structure constants must be real: use a real basis of the algebra")
+        raise ComponentError("structure constants must be real. Use a real basis of the algebra")
     if not np.isfinite(numeric).all():
         a, b, c = np.argwhere(~np.isfinite(numeric))[0]
         raise ComponentError(f"the structure constant C[{a}, {b}, {c}] is {numeric[a, b, c]}")
@@ -52,7 +52,7 @@ def constants_and_matrices(basis) -> tuple[np.ndarray, np.ndarray]:
     norms = np.linalg.norm(matrices, axis=(1, 2))
     if not norms.all():
         raise ClosureError(
-            f"e{norms.argmin() + 1} is the zero matrix; remove it, since a basis must be linearly independent"
+            f"e{norms.argmin() + 1} is the zero matrix. Remove it, since a basis must be linearly independent"
         )
     matrices, input_matrices = (
         matrices / norms[:, None, None],
@@ -63,7 +63,7 @@ def constants_and_matrices(basis) -> tuple[np.ndarray, np.ndarray]:
     if dim > columns.shape[0] or singular_values[-1] <= 1e-10 * singular_values[0]:
         raise ClosureError(
             f"the {dim} matrices are linearly dependent over the reals (smallest over largest singular value "
-            f"{singular_values[-1] / singular_values[0]:.1e}); remove the superfluous ones",
+            f"{singular_values[-1] / singular_values[0]:.1e}). Remove the superfluous ones",
             residual=float(singular_values[-1]),
             tolerance=float(1e-10 * singular_values[0]),
         )
@@ -105,7 +105,7 @@ def check_axioms(
         a, b = (int(i) for i in np.unravel_index(symmetric_parts.argmax(), symmetric_parts.shape))
         raise AntisymmetryError(
             f"{name}: [{labels[a]}, {labels[b]}] + [{labels[b]}, {labels[a]}] has a component of size "
-            f"{symmetric_parts.max() * unit:.3g} ({check_text.format(tolerance)}); set C[b, a, :] = -C[a, b, :]",
+            f"{symmetric_parts.max() * unit:.3g} ({check_text.format(tolerance)}). Set C[b, a, :] = -C[a, b, :]",
             residual=float(symmetric_parts.max() * unit),
             tolerance=tolerance,
             indices=(a, b),

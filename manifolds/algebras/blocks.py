@@ -48,6 +48,7 @@ def power(g: LieAlgebra, sites) -> DirectSum:
     Parameters
     ----------
     g : LieAlgebra
+        The algebra to copy.
     sites : int or tuple of int
         Number of copies; a tuple, such as ``(64, 64)``, for a lattice.
 
@@ -466,10 +467,12 @@ def semidirect_sum(g: LieAlgebra, representation, name: str | None = None, *, id
     Parameters
     ----------
     g : LieAlgebra
+        The algebra that acts.
     representation : array, shape (g.dim, m, m), or callable
         The matrices ``rho(e_a)``, or a function from components x, shape (dim,), to ``rho(x)``. With an ideal these are
         derivations of it: the columns of ``rho(e_a)`` are the images of the basis elements.
     name : str, optional
+        The name in messages.
     ideal : LieAlgebra, of dimension m, optional
         The algebra of u and v; by default the abelian algebra of a vector space.
 

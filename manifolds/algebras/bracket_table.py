@@ -50,16 +50,16 @@ def _checked_table(brackets: Mapping) -> dict[tuple[str, str], Combination]:
     table: dict[tuple[str, str], Combination] = {}
     for pair, value in brackets.items():
         if not isinstance(pair, tuple) or len(pair) != 2 or not all(isinstance(name, str) for name in pair):
-            raise ParameterError(f"a bracket needs a pair of names such as ('e1', 'e2'), not {pair!r}")
+            raise ParameterError(f"a bracket needs a pair of names such as ('e1', 'e2'), got {pair!r}")
         first, second = pair
         combination = _combination(value, pair)
         if first == second and combination:
-            raise AntisymmetryError(f"[{first}, {first}] must be zero, got {value!r}; remove this entry")
+            raise AntisymmetryError(f"[{first}, {first}] must be zero, got {value!r}. Remove this entry")
         opposite = table.get((second, first))
         if first != second and opposite is not None and opposite != {n: -c for n, c in combination.items()}:
             raise AntisymmetryError(
                 f"[{second}, {first}] = {brackets[second, first]!r} contradicts [{first}, {second}] = {value!r}: one "
-                "must be minus the other; give one of the two only"
+                "must be minus the other. Give one of the two only"
             )
         if opposite is None:
             table[pair] = combination
@@ -71,7 +71,7 @@ def _combination(value, pair: tuple[str, str]) -> Combination:
     if isinstance(value, str):
         if not value.removeprefix("-").strip().isidentifier():
             raise ComponentError(
-                f"the bracket of {pair} must be one name such as 'e3' or '-e3', not {value!r}; a combination is a "
+                f"the bracket of {pair} must be one name such as 'e3' or '-e3', got {value!r}; a combination is a "
                 "dictionary such as {'e3': 2, 'e4': 1}"
             )
         return {value.removeprefix("-").strip(): Fraction(-1 if value.startswith("-") else 1)}
@@ -79,12 +79,12 @@ def _combination(value, pair: tuple[str, str]) -> Combination:
         return {}
     if not isinstance(value, Mapping) or not all(isinstance(name, str) for name in value):
         raise ComponentError(
-            f"the bracket of {pair} must be a name such as 'e3', a dictionary such as {{'e3': 2}}, or 0, not {value!r}"
+            f"the bracket of {pair} must be a name such as 'e3', a dictionary such as {{'e3': 2}}, or 0, got {value!r}"
         )
     for name, coefficient in value.items():
         if isinstance(coefficient, bool) or not isinstance(coefficient, Real) or not np.isfinite(float(coefficient)):
             raise ComponentError(
-                f"the coefficient of {name!r} in the bracket of {pair} must be a finite real number, not "
+                f"the coefficient of {name!r} in the bracket of {pair} must be a finite real number, got "
                 f"{coefficient!r}"
             )
     return {name: Fraction(c) if isinstance(c, Rational) else float(c) for name, c in value.items() if c != 0}
@@ -94,7 +94,7 @@ def _basis_names(table: Mapping[tuple[str, str], Combination]) -> list[str]:
     """Return all names of a table: by their numbers if all are one letter string with a number, else as they come."""
     names = list(dict.fromkeys(name for pair, combination in table.items() for name in (*pair, *combination)))
     if not names:
-        raise ParameterError("brackets has no elements; give basis=('e1', 'e2', …) for an abelian algebra")
+        raise ParameterError("brackets has no elements. Give basis=('e1', 'e2', …) for an abelian algebra")
     numbered_names = [re.fullmatch(r"(.*?)(\d+)", name) for name in names]
     matches = [match for match in numbered_names if match is not None]
     if len(matches) == len(names) and len({match[1] for match in matches}) == 1:

@@ -48,14 +48,14 @@ class TracePolynomial:
 
     It represents a Casimir with too many monomials to expand. Like a :class:`Polynomial` it is immutable, hashable, a
     static leaf of a pytree, and callable on batches; JAX differentiates it (``jax.grad``). One value costs a few
-    products
-    of matrices.
+    products of matrices.
 
     Parameters
     ----------
     matrices : array of float, shape (dim, m, m)
         The X_a.
     degree : int
+        Degree of the polynomial.
     weight : array of float, shape (m, m), optional
         W, the identity by default.
     label : str
@@ -399,7 +399,7 @@ def casimirs(g: AlgebraStructure, degree: int) -> list[Polynomial | TracePolynom
         warning: its Casimirs are polynomials, of degree 2 and more [Chevalley].
     """
     if isinstance(degree, bool) or not isinstance(degree, int | np.integer) or degree < 1:
-        raise ParameterError(f"the degree of a Casimir must be an integer >= 1, not {degree!r}")
+        raise ParameterError(f"the degree of a Casimir must be an integer >= 1, got {degree!r}")
     casimir_list: list[Polynomial | TracePolynomial]
     try:
         casimir_list = list(new_casimirs(g, int(degree)))
@@ -423,7 +423,7 @@ def casimirs(g: AlgebraStructure, degree: int) -> list[Polynomial | TracePolynom
 def casimirs_up_to(g: AlgebraStructure, max_degree: int) -> list:
     """Return the polynomial Casimirs of degrees 1 to ``max_degree``; the warning of :func:`casimirs` comes once."""
     if isinstance(max_degree, bool) or not isinstance(max_degree, int | np.integer) or max_degree < 1:
-        raise ParameterError(f"max_degree must be an integer >= 1, not {max_degree!r}")
+        raise ParameterError(f"max_degree must be an integer >= 1, got {max_degree!r}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NoPolynomialCasimirWarning)
         lower_casimirs = [F for degree in range(1, int(max_degree)) for F in g.casimirs(degree)]

@@ -285,6 +285,7 @@ def bianchi(kind: str, h: float | None = None) -> LieAlgebra:
     Parameters
     ----------
     kind : "I" … "IX"
+        Type in Bianchi's list.
     h : float
         For VI (h <= 0; h = 0 is VI_0, h = -1 is III) and VII (h >= 0; h = 0 is VII_0) only, where it must be given.
 
@@ -306,7 +307,7 @@ def bianchi(kind: str, h: float | None = None) -> LieAlgebra:
     if not is_family and h is not None:
         raise ParameterError(f"Bianchi {kind} has no parameter h")
     if h is not None and (not math.isfinite(h) or h * (1 if kind == "VII" else -1) < 0):
-        raise ParameterError(f"Bianchi {kind} needs h {'>=' if kind == 'VII' else '<='} 0, not {h}")
+        raise ParameterError(f"Bianchi {kind} needs h {'>=' if kind == 'VII' else '<='} 0, got {h}")
     a = math.sqrt(abs(h or 0.0))
     n1, n2, n3, a = {
         "I": (0, 0, 0, 0),

@@ -43,14 +43,15 @@ class LieAlgebra(StructureMethods):
     Build one with :meth:`from_structure_constants`, :meth:`from_matrices`, or a name of the catalogue
     (``manifolds.so(3)``). Two algebras are equal when their constants and matrices are.
 
-    Statements about the structure (``is_semisimple``, ``derived_series``, …) do not depend on the basis: they are
-    decided after a scaling of the basis elements that makes the constants of similar size. Constants below 1e-10 then
-    count as rounding.
+    Statements about the structure (``is_semisimple``, ``derived_series``, …) do not depend on the basis: it is scaled
+    first, so that the constants have similar sizes. Constants below 1e-10 then count as zero.
 
     Attributes
     ----------
     dim : int
+        The dimension.
     name : str
+        The name in messages.
     structure_constants : ndarray, shape (dim, dim, dim), read-only
         ``C[a, b, c]`` with ``[e_a, e_b] = sum_c C[a, b, c] e_c``.
     rational_constants : RationalArray or None
@@ -58,22 +59,17 @@ class LieAlgebra(StructureMethods):
     basis : ndarray, shape (dim, m, m), or None
         The matrices ``e_a``, where known.
     basis_names : tuple of str, or None
-        What the basis elements are called, and the components of mu in Casimirs and pictures with them; see
-        :meth:`with_basis_names`.
+        Names of the basis elements in Casimirs and figures; see :meth:`with_basis_names`.
 
     Notes
     -----
-    Large algebras, and copies of one (``g ** n``), are algebras of this class too: they know what they do and not how
-    it is written, and make the constants, the matrices and the forms only when these are asked for. What systems and
-    dissipations ask of an algebra is ``dim``, ``shape``, :meth:`bracket`, :meth:`ad_star`, :meth:`action`,
-    :meth:`killing_inner_product`, :meth:`killing_signature`, :meth:`is_semisimple`, :meth:`is_solvable`,
-    :meth:`casimir_count` and :meth:`leading_casimirs`; none of it takes a dim by dim matrix from these.
+    Large algebras, and copies of one (``g ** n``), are of this class too; they compute the constants, the matrices and
+    the forms only on demand. More members: ``dir(g)``, such as ``radical``, ``isomorphism_type``, ``change_of_basis``.
 
     Examples
     --------
     >>> C = np.zeros((3, 3, 3))
-    >>> C[0, 1, 2] = 1  # [e1, e2] = e3
-    >>> C[0, 2, 1] = -1  # [e1, e3] = -e2: the motions of the plane
+    >>> C[0, 1, 2], C[0, 2, 1] = 1, -1  # [e1, e2] = e3, [e1, e3] = -e2: the plane
     >>> g = mf.LieAlgebra.from_structure_constants(C - C.swapaxes(0, 1), name="plane")
     >>> print(*g.casimirs(degree=2))
     mu2**2 + mu3**2
@@ -163,18 +159,14 @@ class LieAlgebra(StructureMethods):
             The brackets by pairs of names. A value is a name, such as ``"e3"`` or ``"-e3"``, a dictionary from names to
             coefficients (int, Fraction or float), or 0.
         name : str
+            The name in messages.
         basis : sequence of str, optional
-            The names of all basis elements, each an identifier, in their order. By default the names that occur,
-            ordered by their numbers if they are ``e1``, ``e2``, …, and otherwise as they occur.
+            The names of all basis elements in their order; by default ``e1``, ``e2``, … or the order of occurrence.
 
         Raises
         ------
-        ParameterError, ComponentError
-            If a name is not in ``basis``, or a value is no combination of names.
-        AntisymmetryError
-            If two entries contradict each other.
-        JacobiError
-            If the Jacobi identity fails; the message names the three elements.
+        ParameterError, ComponentError, AntisymmetryError, JacobiError
+            For unknown names, contradictory entries, or brackets that break the Jacobi identity.
 
         Examples
         --------
@@ -223,8 +215,7 @@ class LieAlgebra(StructureMethods):
         """Return an equal algebra whose basis elements have names.
 
         Its Casimirs print with these names instead of ``mu1``, ``mu2``, …; pictures label their axes with them, and
-        sums of
-        algebras that all have names keep them.
+        sums of algebras that all have names keep them.
 
         Raises
         ------
@@ -287,21 +278,7 @@ class LieAlgebra(StructureMethods):
     def ad_star(self, x, mu) -> jax.Array:
         """Return the coadjoint operator ``ad*_x mu``, defined by ``<ad*_x mu, y> = <mu, [x, y]>`` [BFM, after 3.1].
 
-        Parameters
-        ----------
-        x : array, shape (..., dim)
-            Algebra element (1/time for a body).
-        mu : array, shape (..., dim)
-            Dual element (mass * length**2 / time for a body).
-
-        Returns
-        -------
-        array, shape (..., dim)
-
-        Raises
-        ------
-        ShapeError
-            If the last axes differ from ``dim``.
+        ``x`` (an angular velocity for a body), ``mu`` (its angular momentum) and the result have shape (..., dim).
         """
         return jnp.einsum(
             "abc,...a,...c->...b", real_array(self.structure_constants), self._element(x, "x"), self._element(mu, "mu")
@@ -332,10 +309,7 @@ class LieAlgebra(StructureMethods):
     def vee(self, X) -> jax.Array:
         """Return the components of a matrix of the algebra, shape (..., dim): the inverse of :meth:`hat`.
 
-        Raises
-        ------
-        LieAlgebraError
-            If ``X`` is not in the span of the basis (residual above 1e-8 relative; not checked under tracing).
+        LieAlgebraError if ``X`` is not in the span of the basis (residual above 1e-8 relative), except under tracing.
         """
         basis = self._require_basis()
         matrix = square_matrices(X, basis.shape[-1], "X")
@@ -393,10 +367,9 @@ class LieAlgebra(StructureMethods):
         """Return a Cartan involution theta, shape (dim, dim), for which ``-kappa(x, theta y)`` is positive definite.
 
         It is the identity on compact type. Otherwise it is computed without matrices: among all inner products of unit
-        volume,
-        the one that minimises the norm of the bracket satisfies ``ad_x^T = -ad_{theta x}`` [Lauret 2003]; the norm is
-        convex along the geodesics of inner products, so Newton's method finds it. For ``sl``, ``so`` and ``sp`` in
-        their usual bases theta is ``X -> -X^T``.
+        volume, the one that minimises the norm of the bracket satisfies ``ad_x^T = -ad_{theta x}`` [Lauret 2003]; the
+        norm is convex along the geodesics of inner products, so Newton's method finds it. For ``sl``, ``so`` and ``sp``
+        in their usual bases theta is ``X -> -X^T``.
 
         Raises
         ------
@@ -484,13 +457,9 @@ class LieAlgebra(StructureMethods):
         max_degree : int, optional
             Return the Casimirs of all degrees from 1 to this one instead, by default to 4.
 
-        Raises
-        ------
-        ParameterError
-            If both ``degree`` and ``max_degree`` are given, or one is no positive integer.
         """
         if degree is not None and max_degree is not None:
-            raise ParameterError("casimirs takes degree or max_degree, not both; give one of them")
+            raise ParameterError("casimirs takes degree or max_degree, not both. Give one of them")
         if degree is not None:
             return self._casimirs_of_degree(degree)
         return casimirs_up_to(self, DEFAULT_MAX_DEGREE if max_degree is None else max_degree)
@@ -591,6 +560,7 @@ def trilinear_form(algebra: LieAlgebra, form=None) -> np.ndarray:
     Parameters
     ----------
     algebra : LieAlgebra
+        The Lie algebra.
     form : array, shape (dim, dim), optional
         By default the Killing form, for which the tensor is totally skew.
 
@@ -605,5 +575,5 @@ def trilinear_form(algebra: LieAlgebra, form=None) -> np.ndarray:
     if form.shape != (algebra.dim, algebra.dim):
         raise ShapeError(f"the form on {algebra.name} must have shape ({algebra.dim}, {algebra.dim}), got {form.shape}")
     if not np.isfinite(form).all():
-        raise ComponentError(f"the form on {algebra.name} must be finite, not {form.tolist()}")
+        raise ComponentError(f"the form on {algebra.name} must be finite, got {form.tolist()}")
     return np.einsum("ae,bde->abd", form, np.asarray(algebra.structure_constants))

@@ -27,13 +27,13 @@ def magnetic_extension(g: LieAlgebra, by_brackets: bool | None = None) -> LieAlg
 
     Momenta are pairs (W, B) of W in g* and B in g, with ``ad*_(x, a) (W, B) = (ad*_x W - ad*_B a, -[x, B])``: B is
     carried by the velocity x and pushes back on W. The extension of so(3) is the algebra of the heavy top, and that of
-    the fields without divergence is the one of ideal magnetohydrodynamics [Vishik & Dolzhanskii 1978; Marsden, Ratiu
-    & Weinstein 1984].
-    Invariant functions f(B) are Casimirs, and so is the cross helicity ``<W, B>``.
+    the fields without divergence is the one of ideal magnetohydrodynamics [Vishik & Dolzhanskii 1978; Marsden, Ratiu &
+    Weinstein 1984]. Invariant functions f(B) are Casimirs, and so is the cross helicity ``<W, B>``.
 
     Parameters
     ----------
     g : LieAlgebra
+        The algebra to extend.
     by_brackets : bool, optional
         Whether the extension acts by the brackets of g, without structure constants of its own: by default above
         dimension 40.

@@ -243,7 +243,7 @@ class MatrixAlgebra(BracketAlgebra):
             If the degree is that of the Pfaffian, which is not formed for large matrices.
         """
         if isinstance(degree, bool) or not isinstance(degree, int | np.integer) or degree < 1:
-            raise ParameterError(f"the degree of a Casimir must be an integer >= 1, not {degree!r}")
+            raise ParameterError(f"the degree of a Casimir must be an integer >= 1, got {degree!r}")
         if degree == self.classical_data.pfaffian_degree:
             raise LieAlgebraError(
                 f"{self.name} has a Casimir of degree {degree}, its Pfaffian, that is not formed for large matrices; "

@@ -81,7 +81,7 @@ def patera(name: str, **parameters: float) -> LieAlgebra:
         example = ", ".join(f"{p}=…" for p in entry.parameters)
         raise ParameterError(
             f"{name} has {'the parameters ' + ', '.join(entry.parameters) if entry.parameters else 'no parameters'}, "
-            f"got {', '.join(parameters) or 'none'}; write patera({name!r}{', ' + example if example else ''})"
+            f"got {', '.join(parameters) or 'none'}. Write patera({name!r}{', ' + example if example else ''})"
         )
     for parameter, value in parameters.items():
         if not math.isfinite(value):

@@ -29,14 +29,15 @@ class Polynomial(metaclass=ListedType):
     """Polynomial in the components ``mu1, mu2, …`` of ``mu``.
 
     Polynomials are immutable and hashable, hence static leaves of a pytree. Sums, differences and products with
-    polynomials
-    and numbers are polynomials; coefficients stay exact as long as every number involved is an integer or a fraction.
+    polynomials and numbers are polynomials; coefficients stay exact as long as every number involved is an integer or a
+    fraction.
 
     Parameters
     ----------
     exponents : array of int, shape (terms, dim)
         One row for each monomial; equal rows are added up.
     coefficients : sequence of int, Fraction or float, length terms
+        Coefficients of the monomials.
 
     Attributes
     ----------
@@ -185,7 +186,7 @@ def _coefficient(value) -> Coefficient:
     if isinstance(value, Rational):
         return Fraction(int(value.numerator), int(value.denominator))
     if not isinstance(value, Real) or not math.isfinite(value):
-        raise ComponentError(f"a coefficient must be a finite real number, not {value!r}")
+        raise ComponentError(f"a coefficient must be a finite real number, got {value!r}")
     return float(value)
 
 
@@ -271,13 +272,13 @@ class Formula:
         try:
             tree = ast.parse(self.text, mode="eval")
         except SyntaxError as error:
-            raise ParameterError(f"the formula {self.text!r} cannot be read: {error}; write it as in Python") from None
+            raise ParameterError(f"the formula {self.text!r} cannot be read: {error}. Write it as in Python") from None
         for node in ast.walk(tree):
             unknown_name = isinstance(node, ast.Name) and node.id not in {*self.names, *FUNCTIONS}
             if unknown_name or not isinstance(node, _SYNTAX):
                 part = ast.unparse(node) if isinstance(node, ast.expr) else type(node).__name__
                 raise ParameterError(
-                    f"the formula {self.text!r} contains {part!r}; use the names {', '.join(self.names)}, numbers and "
+                    f"the formula {self.text!r} contains {part!r}. Use the names {', '.join(self.names)}, numbers and "
                     f"the functions {', '.join(FUNCTIONS)}"
                 )
 

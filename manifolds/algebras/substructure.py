@@ -155,7 +155,7 @@ def nilradical(work: WorkingConstants) -> np.ndarray:
             return ideal
     raise LieAlgebraError(
         f"{work.name}: no element of the radical was found that separates its weights, so the nilradical is not "
-        "known; give the structure constants as fractions, or rescale the basis"
+        "known. Give the structure constants as fractions, or rescale the basis"
     )
 
 

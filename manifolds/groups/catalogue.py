@@ -190,7 +190,7 @@ def subalgebra_basis(group: MatrixGroup, spanning_matrices) -> np.ndarray:
         )
     if len(directions) and (rank := np.linalg.matrix_rank(directions)) < len(directions):
         raise ParameterError(
-            f"the {len(directions)} matrices of the stabilizer in {group.name} span {rank} dimensions only: leave one "
+            f"the {len(directions)} matrices of the stabilizer in {group.name} span {rank} dimensions only. Leave one "
             "out"
         )
     rows = np.linalg.qr(directions.T)[0].T

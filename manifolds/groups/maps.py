@@ -360,7 +360,7 @@ def fields_from_equations(function: Callable, n: int, name: str) -> dict[str, An
         )
     scale = float(np.abs(derivative).max(initial=0.0))
     if not scale > 0.0:
-        raise ParameterError("the derivative of f at the identity is zero, so it defines no algebra; use a first power")
+        raise ParameterError("the derivative of f at the identity is zero, so it defines no algebra. Use a first power")
     left, singular_values, _ = np.linalg.svd(derivative / scale)
     vectors = numerical_null_space(derivative / scale, name)
     if not len(vectors):

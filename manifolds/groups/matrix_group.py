@@ -74,13 +74,14 @@ class MatrixGroup(metaclass=ListedType):
 
     Build one with its name (``manifolds.SO(3)``). A new group needs its algebra, with matrices, and ``defect``; the
     other maps default to general matrix functions. Before such a map is used, :meth:`map_defect` tests at random
-    elements
-    that it stays in the group.
+    elements that it stays in the group.
 
     Attributes
     ----------
     name : str
+        The name in messages.
     algebra : LieAlgebra
+        Its Lie algebra.
     defect : callable
         ``g -> array``, shape (...): the distance of g from the group relative to its size, of the order of the smallest
         relative change of g that brings it there. A function of one matrix is applied to each matrix of a batch.
@@ -126,13 +127,12 @@ class MatrixGroup(metaclass=ListedType):
         n : int
             The size of the matrices.
         name : str
+            The name in messages.
 
         Raises
         ------
-        ParameterError
-            If f does not vanish at the identity, has no derivative there, or no other solutions nearby.
-        ClosureError
-            If the kernel is no algebra, or exponentials of its elements are no solutions.
+        ParameterError, ClosureError
+            If f does not vanish at the identity or its solutions nearby do not form a group.
 
         Examples
         --------
@@ -234,17 +234,15 @@ class MatrixGroup(metaclass=ListedType):
         Returns
         -------
         array, shape (..., dim)
-            Accurate to rounding; where the logarithm itself is ill-conditioned, as for a pair of eigenvalues at the
-            angles +-(pi - d) in a noncompact group, to about 1e-15/d. Its derivative is that of x along the group:
-            changes of g that leave the group are projected out. A half turn has two logarithms, pi times an axis and
-            its negative: the one is returned whose first component that is not zero (1e-8 of the axis) is positive.
-            That holds up to 1e-8 from the half turn, where the angle may be larger than pi by as much. More than one
-            plane turned by pi, and -I in SU(2), have a continuum of logarithms with nothing to choose one by.
+            Accurate to rounding, but only to about 1e-15/d for a pair of eigenvalues at the angles +-(pi - d) in a
+            noncompact group. Derivatives are those along the group. A half turn (within 1e-8) has two logarithms; the
+            first nonzero component of the one returned is positive.
 
         Raises
         ------
         DomainError
-            If g is not in the group, or has no principal logarithm. Under tracing the result is NaN instead.
+            If g is not in the group, or has no single principal logarithm, such as -I in SU(2). Under tracing the
+            result is NaN instead.
         """
         g = self._element(g, "g")
         x = _log(self, g)
@@ -374,11 +372,7 @@ class MatrixGroup(metaclass=ListedType):
         Parameters
         ----------
         g : array, shape (..., m, m)
-        mu : array, shape (..., dim)
-
-        Returns
-        -------
-        array, shape (..., dim)
+        mu : array, shape (..., dim); the result has the same shape
         """
         return jnp.einsum("...ab,...a->...b", self.Ad(g), self._components(mu, "mu"))
 
@@ -392,7 +386,7 @@ class MatrixGroup(metaclass=ListedType):
         matrix = square_matrices(g, self.matrix_size, label)
         if jnp.iscomplexobj(matrix) and not np.iscomplexobj(self.algebra._require_basis()):
             raise ComponentError(
-                f"{label} must be real for {self.name}, not {matrix.dtype}: take its real part if that is meant"
+                f"{label} must be real for {self.name}, got {matrix.dtype}. Take its real part if that is meant"
             )
         return matrix.astype(self.algebra._require_basis().dtype)
 
@@ -413,13 +407,13 @@ class MatrixGroup(metaclass=ListedType):
         if map_name == "logarithm" and self.is_complex and is_below_half_turn and abs(total := angles.sum()) > np.pi:
             return (
                 f"has eigenvalues whose angles sum to {total:.6g}, so its principal logarithm is not in "
-                f"{self.algebra.name}: take the logarithm of g relative to a nearer element h, that is of "
+                f"{self.algebra.name}. Use the logarithm of g relative to a nearer element h, that is of "
                 "compose(inverse(h), g)"
             )
         eigenvalue = eigenvalues[np.abs(np.angle(eigenvalues)).argmax()]
         return (
             f"has the eigenvalue {eigenvalue:.6g} at the angle {abs(np.angle(eigenvalue)):.10f}, and det g = "
-            f"{np.linalg.det(g):.3g}; the {requirement}: take the {map_name} of g relative to a nearer element h, that "
+            f"{np.linalg.det(g):.3g}; the {requirement}. Use the {map_name} of g relative to a nearer element h, that "
             "is of compose(inverse(h), g)"
         )
 

@@ -324,8 +324,7 @@ def log_mean(logs, shift, x) -> jax.Array:
     exp(logs)``.
 
     In eigenvectors of A ``(L X)_kl = X_kl (u - v) / (ln u - ln v)`` with ``u = e^-s p_k`` and ``v = e^s p_l``. The mean
-    is
-    the divided difference of exp at the logarithms, and so has all its derivatives [Carlen & Maas 2017].
+    is the divided difference of exp at the logarithms, and so has all its derivatives [Carlen & Maas 2017].
 
     Parameters
     ----------

@@ -275,6 +275,7 @@ class MidpointRetraction(Retraction):
     Parameters
     ----------
     chart : Chart
+        The chart in which steps are taken.
     """
 
     chart: Chart

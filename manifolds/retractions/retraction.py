@@ -86,7 +86,7 @@ class Retraction(metaclass=ListedABCMeta):
             radius = self.space.injectivity_radius(jnp.broadcast_arrays(z, v)[0][index])
             raise DomainError(
                 f"{self}: the step h v{format_index(index)} is {float(reach[index]):.6g} times as long as its inverse "
-                f"reaches (injectivity radius of the space {radius:.6g}): take a smaller step"
+                f"reaches (injectivity radius of the space {radius:.6g}). Use a smaller step"
             )
         return run_kernel(self, "_end_points", (), z, v)
 
@@ -200,7 +200,7 @@ class Chart(Retraction):
     def _carry(self, z, v, u):
         """Implement :meth:`carry`."""
         raise SpaceError(
-            f"{self} gives no _carry, so its base point cannot lie in the middle of a step: take retraction='exp', "
+            f"{self} gives no _carry, so its base point cannot lie in the middle of a step. Use retraction='exp', "
             "which has it at the start"
         )
 
@@ -239,6 +239,7 @@ class Place(NamedTuple):
     Attributes
     ----------
     point : array, shape ``(..., *shape)``
+        A point of the space.
     lift : function
         From a covector of R^dim, shape (..., dim), to the ambient covector with equal products with tangent vectors.
     lower : function

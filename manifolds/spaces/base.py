@@ -51,12 +51,11 @@ class Space(SpaceMaps):
 
     A subclass is a frozen dataclass, decorated with ``jax.tree_util.register_static``. It implements ``name``, ``dim``,
     ``shape`` and ``_project``, and may override the other members that begin with an underscore; each is a plain JAX
-    function of checked arrays with leading batch axes. The tangent spaces follow from ``_project``, any smooth
-    map from arrays to points that leaves points unchanged; the metric is that of the ambient array unless ``_inner`` is
-    overridden. There are geodesics if ``_exp``, ``_log`` and ``_transport`` are given, with
-    :meth:`injectivity_radius`; a space without geodesics runs in the chart of a
-    :class:`manifolds.ProjectionRetraction`, or
-    of a chart of your own. A closed form is faster than a derived map: the native spaces have all of them.
+    function of checked arrays with leading batch axes. The tangent spaces follow from ``_project``, any smooth map from
+    arrays to points that leaves points unchanged; the metric is that of the ambient array unless ``_inner`` is
+    overridden. There are geodesics if ``_exp``, ``_log`` and ``_transport`` are given, with :meth:`injectivity_radius`;
+    a space without geodesics runs in the chart of a :class:`manifolds.ProjectionRetraction`, or of a chart of your own.
+    A closed form is faster than a derived map: the native spaces have all of them.
 
     Attributes
     ----------
@@ -84,9 +83,8 @@ class Space(SpaceMaps):
 
         Raises
         ------
-        OffManifoldError
-            If x is off the space; the message names the residual and the tolerance. Not checked under tracing.
-        ShapeError, ComponentError
+        OffManifoldError, ShapeError, ComponentError
+            If x is off the space (not checked under tracing), or no array of real numbers of this shape.
         """
         return self._checked_point(self.project(x) if project else self._ambient_array(x, "x"), "x", tolerance)
 
@@ -101,10 +99,7 @@ class Space(SpaceMaps):
     def project(self, x) -> jax.Array:
         """Return a point of the space near x, the nearest one if that has a simple form, shape ``(..., *shape)``.
 
-        Raises
-        ------
-        DomainError
-            If there is none, as for the centre of a sphere.
+        DomainError if there is none, as for the centre of a sphere.
         """
         x = self._ambient_array(x, "x")
         y = self._call_compiled("_project", x)
@@ -240,13 +235,14 @@ class Space(SpaceMaps):
         Parameters
         ----------
         x, y : array, shape ``(..., *shape)``
+            Points.
 
         Raises
         ------
         DomainError
             If y is at the cut locus of x, as its antipode is on a sphere, or (SU(n) with n > 2, Stiefel) beyond the
-            domain of the logarithm used. Under tracing the result is NaN instead. A rotation by pi in one plane is no
-            error: of its two logarithms the one of :meth:`manifolds.MatrixGroup.log` is returned.
+            domain of the logarithm used; under tracing the result is NaN. For a rotation by pi in one plane, see
+            :meth:`manifolds.MatrixGroup.log`.
         """
         x, y = self._checked_point(x, "x"), self._checked_point(y, "y")
         v = self._call_compiled("_log", x, y)
@@ -256,10 +252,9 @@ class Space(SpaceMaps):
     def distance(self, x, y) -> jax.Array:
         """Return the length of the shortest geodesic from x to y, shape (...).
 
-        The distance has no derivative where x and y are one point; there its derivative is taken as 0. Its square has
-        all: ``distance(x, y)**2`` has the exact gradient 0 and, as its Hessian, twice the metric. Other functions of
-        the distance that are smooth there, such as ``1 - cos(d)``, have exact derivatives up to the third only: write
-        them with :meth:`squared_distance` where higher ones matter.
+        The derivative at y = x is taken as 0. ``distance(x, y)**2`` has exact derivatives there. Other smooth functions
+        of the distance, such as ``1 - cos(d)``, have exact derivatives up to the third: use :meth:`squared_distance`
+        if you need higher ones.
 
         Raises
         ------
@@ -318,7 +313,7 @@ class Space(SpaceMaps):
         array = jnp.asarray(numeric_array(x, label))
         if jnp.iscomplexobj(array) and self.dtype.kind != "c":
             raise ComponentError(
-                f"{label} must be real for {self.name}, not {array.dtype}: take its real part if that is meant"
+                f"{label} must be real for {self.name}, got {array.dtype}. Take its real part if that is meant"
             )
         if array.shape[array.ndim - len(self.shape) :] != self.shape or array.ndim < len(self.shape):
             expected_shape = f"(..., {', '.join(map(str, self.shape))})"

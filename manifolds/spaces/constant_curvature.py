@@ -124,8 +124,7 @@ class Sphere(Space):
     """Unit vectors of R^(n+1), shape (n + 1,), with the metric induced by R^(n+1).
 
     Distances are angles. All maps have closed forms, accurate to rounding up to the antipode; there the direction of
-    the
-    logarithm is known to 1e-16 over the distance from the antipode, as its arguments are.
+    the logarithm is known to 1e-16 over the distance from the antipode, as its arguments are.
 
     Parameters
     ----------

@@ -42,8 +42,7 @@ def from_geomstats(space, injectivity_radius: float | None = None) -> GeomstatsS
         For example ``Hypersphere(2)`` or ``PoincareBall(2)``, with points of its own kind: see ``space.shape``.
     injectivity_radius : float, optional
         By default the radius of the metric, and infinite if the metric has none; for SO(n) and SE(n) pi and sqrt(2) pi,
-        as
-        geomstats 2.8 returns larger values than the true ones.
+        as geomstats 2.8 returns larger values than the true ones.
 
     Raises
     ------
@@ -62,7 +61,7 @@ def from_geomstats(space, injectivity_radius: float | None = None) -> GeomstatsS
         raise SpaceError(f"from_geomstats(space): space must be a geomstats manifold, got {type(space).__name__}")
     if not backend.__name__.endswith("numpy"):
         raise SpaceError(
-            f"geomstats must run with NumPy, got the backend {backend.__name__}; set GEOMSTATS_BACKEND=numpy"
+            f"geomstats must run with NumPy, got the backend {backend.__name__}. Set GEOMSTATS_BACKEND=numpy"
         )
     if getattr(space, "metric", None) is None:
         raise SpaceError(f"{_name(space)} has no metric: equip it with one, space.equip_with_metric(...)")
@@ -83,6 +82,7 @@ class GeomstatsSpace(Space):
     Attributes
     ----------
     source : geomstats Manifold
+        The manifold of geomstats.
     """
 
     is_smooth = False

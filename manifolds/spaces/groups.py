@@ -31,13 +31,11 @@ class GroupSpace(Space):
     """Matrix group as a state space, native or user-defined; tangent vectors at g are ``g hat(xi)``.
 
     The metric is left-invariant. ``exp(x, x hat(xi))`` is ``x exp(xi)``, whatever the metric: these curves are
-    geodesics of
-    the connection for which left-invariant fields are parallel, which preserves inner products, and of the metric
-    itself if
-    it is right-invariant too. Therefore :meth:`transport` preserves the velocity xi, and :meth:`distance` is the length
-    of
-    ``log(x^-1 y)``, not less than that of the shortest curve. SO(n), SU(n) and SE(n) are spaces of their own, with the
-    Riemannian geodesics: :class:`SpecialOrthogonal`, :class:`SpecialUnitary`, :class:`SpecialEuclidean`.
+    geodesics of the connection for which left-invariant fields are parallel, which preserves inner products, and of the
+    metric itself if it is right-invariant too. Therefore :meth:`transport` preserves the velocity xi, and
+    :meth:`distance` is the length of ``log(x^-1 y)``, not less than that of the shortest curve. SO(n), SU(n) and SE(n)
+    are spaces of their own, with the Riemannian geodesics: :class:`SpecialOrthogonal`, :class:`SpecialUnitary`,
+    :class:`SpecialEuclidean`.
 
     Parameters
     ----------
@@ -413,13 +411,13 @@ class SpecialEuclidean(GroupSpace):
     """Rigid motions of R^n, with ``inner = tr(W^T W') / 2 + u·u' / length^2`` of velocities W of rotation and u.
 
     The metric is left-invariant and that of the product of SO(n) and R^n: along geodesics the body turns at a constant
-    rate
-    while its origin moves straight. One-parameter subgroups are different curves, screw motions: the group retraction
-    follows them.
+    rate while its origin moves straight. One-parameter subgroups are different curves, screw motions: the group
+    retraction follows them.
 
     Parameters
     ----------
     n : int
+        Dimension of the space of the motions.
     length : float
         The translation that counts as much as a rotation by one radian.
     """

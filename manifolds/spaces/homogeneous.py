@@ -27,13 +27,11 @@ class Homogeneous(Space):
     """Space G/H of a group SO(n) or SU(n) and a subgroup H, with the metric that it inherits from G.
 
     A point is any element g of its class gH; functions must be invariant under ``g -> g h``, h in H. A tangent vector
-    is
-    horizontal: ``g hat(xi)`` with xi orthogonal to the algebra of H; its length is that of xi. A system therefore moves
-    in
-    G, along horizontal fields. Geodesics are ``g exp(t xi)``, and parallel transport along one solves
-    ``eta' = -[xi, eta]_m / 2``, m being the horizontal part [O'Neill 1966; Milnor 1976]. Newton's method computes the
-    logarithm, which is accepted below the distance at which geodesics can have conjugate points; where H winds around
-    in G, as in lens spaces, there may be a shorter one.
+    is horizontal: ``g hat(xi)`` with xi orthogonal to the algebra of H; its length is that of xi. A system therefore
+    moves in G, along horizontal fields. Geodesics are ``g exp(t xi)``, and parallel transport along one solves ``eta' =
+    -[xi, eta]_m / 2``, m being the horizontal part [O'Neill 1966; Milnor 1976]. Newton's method computes the logarithm,
+    which is accepted below the distance at which geodesics can have conjugate points; where H winds around in G, as in
+    lens spaces, there may be a shorter one.
 
     Parameters
     ----------
@@ -42,6 +40,7 @@ class Homogeneous(Space):
     stabilizer : array, shape (k, n, n)
         Matrices that span the algebra of H, which is connected.
     name : str, optional
+        The name in messages.
 
     Raises
     ------

@@ -101,7 +101,7 @@ class LevelSet(Space):
             largest_value = float(np.nanmax(np.asarray(singular_values), initial=0.0))
             raise SpaceError(
                 f"{self.name}: its constraints depend on each other: of their gradients, made unit vectors, the least "
-                f"singular value is at most {largest_value:.1e} at {N_RANDOM_TRIALS} random arrays; leave one out"
+                f"singular value is at most {largest_value:.1e} at {N_RANDOM_TRIALS} random arrays. Leave one out"
             )
         points = self._call_compiled("_project", x)
         has_point = np.asarray(jnp.isfinite(points).all(axis=self._axes))
@@ -117,8 +117,8 @@ class LevelSet(Space):
         if (gradient_ratios < MIN_GRADIENT_RATIO).any():
             i = int(np.argmin(gradient_ratios))
             raise SpaceError(
-                f"{self.name}: the gradient of constraint {i} vanishes on it, near {np.asarray(points)[has_point][0]}: "
-                "give a function that changes its sign there"
+                f"{self.name}: the gradient of constraint {i} vanishes on it, near {np.asarray(points)[has_point][0]}. "
+                "Give a function that changes its sign there"
             )
         if self.form is not None and self._call_compiled("_metric_at", x).shape[-2:] != (self.size, self.size):
             raise ParameterError(
@@ -141,8 +141,7 @@ class LevelSet(Space):
         """Return the point at time 1 of the geodesic from x with velocity v, shape ``shape``, by integration.
 
         The method takes classical Runge-Kutta steps for ``x' = sharp(p)``, ``p' = -d(p . sharp(p))/dx / 2``: the error
-        falls
-        like the fourth power of their number.
+        falls like the fourth power of their number.
 
         Parameters
         ----------
@@ -153,7 +152,7 @@ class LevelSet(Space):
         x, v = self._checked_point_and_vectors(x, v=v)
         end = self._call_compiled("_geodesic", x, v, static=(checked_size(steps, 1, "geodesic", "steps"),))
         if not bool(jnp.isfinite(end).all()):
-            raise DomainError(f"{self.name}: the geodesic could not be followed with {steps} steps: take more")
+            raise DomainError(f"{self.name}: the geodesic could not be followed with {steps} steps. Use more")
         return end
 
     # -- maps ---------------------------------------------------------------------------------------------------------

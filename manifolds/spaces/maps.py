@@ -377,9 +377,8 @@ def safe_sqrt(z):
     smooth.
 
     The root d of a square z has no derivative at zero, but ``d**2`` has: z', and then z''. JAX computes them as
-    ``2 d d'`` with ``d' = z' / (2 d)``. So where z vanishes, the derivative is that of a root ZERO_LENGTH_LIMIT, and
-    this
-    root is the factor in the product too.
+    ``2 d d'`` with ``d' = z' / (2 d)``. So where z vanishes, the root is replaced by
+    ZERO_LENGTH_LIMIT, both in the derivative and in the product.
     """
     positive = z > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, z, 1.0)), jnp.where(z <= 0.0, 0.0, z))

@@ -435,9 +435,8 @@ class TangentBundle(Space):
     """Pairs (q, v) of a point of a space and a tangent vector there, shape ``(2, *base.shape)``.
 
     It represents the cotangent bundle too: a covector p at q is paired with tangent vectors by ``sum(p * v)``, and
-    among
-    the arrays with equal products the tangent one is taken. In these arrays the form ``p dq`` is the
-    canonical one of T*Q. The metric is that of the ambient arrays.
+    among the arrays with equal products the tangent one is taken. In these arrays the form ``p dq`` is the canonical
+    one of T*Q. The metric is that of the ambient arrays.
 
     Parameters
     ----------

@@ -20,8 +20,7 @@ def frechet_mean(space: Space, points, weights=None) -> jax.Array:
     The iteration ``m <- exp(m, sum_i w_i log(m, x_i))`` starts from the point of the space nearest to the mean of the
     arrays, and ends when rounding stops it. The mean is unique for points in a ball of less than half the injectivity
     radius, and of less than ``pi / (4 sqrt(K))`` for sectional curvatures up to K > 0 [Karcher 1977]; for points
-    further
-    apart the result is a point at which the mean square distance is stationary.
+    further apart the result is a point at which the mean square distance is stationary.
 
     Under ``jax.jit``, ``vmap`` and derivatives the mean is NaN where these errors would be raised. Its first
     derivatives are exact, by the implicit function theorem; second ones are not defined.
@@ -29,7 +28,9 @@ def frechet_mean(space: Space, points, weights=None) -> jax.Array:
     Parameters
     ----------
     space : Space
+        The space of the points.
     points : array, shape ``(..., *space.shape)``
+        The points.
     weights : array, shape (...), optional
         Not negative, with a positive sum.
 
@@ -57,7 +58,7 @@ def frechet_mean(space: Space, points, weights=None) -> jax.Array:
         mean = space.exp(mean, step)
     raise DomainError(
         f"the mean on {space.name} did not come to rest: the last of {MAX_ITERATIONS} steps had the length "
-        f"{step_length:.3g}. The points may be too far apart for one mean: take points of a smaller region"
+        f"{step_length:.3g}. The points may be too far apart for one mean. Use points of a smaller region"
     )
 
 

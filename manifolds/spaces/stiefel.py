@@ -62,7 +62,7 @@ class Stiefel(Space):
         checked_size(self.p, 1, "Stiefel(n, p)", "p")
         if self.p >= self.n:
             raise ParameterError(
-                f"Stiefel(n, p): p must be less than n, not {self.p} >= {self.n}; for n = p take SpecialOrthogonal(n)"
+                f"Stiefel(n, p): p must be less than n, got {self.p} >= {self.n}. For n = p use SpecialOrthogonal(n)"
             )
 
     @property
@@ -243,7 +243,7 @@ class Grassmann(Space):
         checked_size(self.n, 2, "Grassmann(n, p)")
         checked_size(self.p, 1, "Grassmann(n, p)", "p")
         if self.p >= self.n:
-            raise ParameterError(f"Grassmann(n, p): p must be less than n, not {self.p} >= {self.n}")
+            raise ParameterError(f"Grassmann(n, p): p must be less than n, got {self.p} >= {self.n}")
 
     @property
     def name(self):

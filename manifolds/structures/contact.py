@@ -214,6 +214,7 @@ class SplitContact(ContactStructure):
     degrees_of_freedom : int
         Components of q: more than the dimension of Q if it is embedded in arrays.
     bundle : manifolds.TangentBundle, optional
+        The tangent bundle of the positions.
     """
 
     degrees_of_freedom: int = eqx.field(static=True)
@@ -314,7 +315,9 @@ class LagrangianContact(SplitContact):
     Parameters
     ----------
     lagrangian : function from (q, v, S) in one array, shape (2n + 1,), to a scalar
+        The Lagrangian (energy).
     degrees_of_freedom : int
+        Number n of positions.
     bundle : manifolds.TangentBundle, optional
         On a manifold Q, n being the number of components of its arrays.
     """

@@ -80,8 +80,7 @@ class PoissonStructure(Module):
         """Return ``K'`` for which x, displaced by K, moves by ``x' = Pi(x) alpha``, shape (n,); None if not known.
 
         The displacement is :meth:`leaf_displacement`. The rate is smooth, and alpha at K = 0: any method finds K, at
-        its order,
-        and the displaced point is on the leaf however K is rounded.
+        its order, and the displaced point is on the leaf however K is rounded.
 
         Parameters
         ----------

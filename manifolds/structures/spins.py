@@ -24,8 +24,7 @@ class Spins(PoissonBySharp):
     site.
 
     It is that of ``so(3)`` at every site, times gyromagnetic ratios, beside ``others`` components y that commute with
-    all.
-    Its Casimirs are the functions of the lengths |s_i| and of y. No array is larger than a state.
+    all. Its Casimirs are the functions of the lengths |s_i| and of y. No array is larger than a state.
 
     Parameters
     ----------

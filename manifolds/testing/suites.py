@@ -96,6 +96,7 @@ def check_algebra(g: LieAlgebra, degree: int = 3, seed: int = 0) -> Report:
     Parameters
     ----------
     g : LieAlgebra
+        The algebra to test.
     degree : int
         Casimirs are looked for up to this degree.
 
@@ -176,6 +177,7 @@ def check_group(G: MatrixGroup, size: float = 0.5, seed: int = 0) -> Report:
     Parameters
     ----------
     G : MatrixGroup
+        The group to test.
     size : float
         Size of the random elements of the algebra; below the radius in which the logarithm is defined.
 
@@ -238,6 +240,7 @@ def check_space(M: Space, length: float = 0.5, seed: int = 0, allowed: float = 1
     Parameters
     ----------
     M : Space
+        The space to test.
     length : float
         Length of the geodesics; at most 0.45 times the injectivity radius is used.
     allowed : float

@@ -94,7 +94,7 @@ CASES = {
     "texts": (lambda: lt.ComposedSystem(["a"]), "body 0 must be an lt.Subsystem or lt.Copies, got str"),
     "maps": (
         lambda: composed_system(momentum_maps=3),
-        "momentum_maps are a dict of functions, or a sequence of them, not int",
+        "momentum_maps must be a dict or a sequence of functions, got int",
     ),
     "parameters": (lambda: lt.Copies(2, lambda x, c: c * x[0], 1, "a"), "made of real numbers, got 'a'"),
     "membrane": (
@@ -189,8 +189,8 @@ CASES = {
     # algebras
     "no algebra": (lambda: mf.trilinear_form("a"), r"a manifolds.LieAlgebra, such as mf.so\(3\), got 'a'"),
     "number": (lambda: mf.trilinear_form(3), r"a manifolds.LieAlgebra, such as mf.so\(3\), got 3"),
-    "NaN": (lambda: mf.trilinear_form(SO3, np.full((3, 3), np.nan)), "must be finite, not .*nan"),
-    "complex form": (lambda: mf.trilinear_form(SO3, 1j * np.eye(3)), "must be real, not complex128"),
+    "NaN": (lambda: mf.trilinear_form(SO3, np.full((3, 3), np.nan)), "must be finite, got .*nan"),
+    "complex form": (lambda: mf.trilinear_form(SO3, 1j * np.eye(3)), "must be real, got complex128"),
 }
 
 

@@ -387,7 +387,7 @@ def test_initial_max_step():
 
 def test_an_endless_span_needs_an_end():
     """SciPy runs for ever."""
-    with pytest.raises(lt.InputError, match=r"set event\.terminal = True"):
+    with pytest.raises(lt.InputError, match=r"Set event\.terminal = True"):
         solve_ivp(OSCILLATOR, (0, np.inf), [1, 0], events=lambda t, y: y[0])
     with pytest.raises(lt.InputError, match=r"infinite end needs lt\.integrate with adaptive steps and an event"):
         lt.integrate(OSCILLATOR, [1.0, 0.0], (0.0, np.inf), 0.1)

@@ -27,6 +27,14 @@ def test_a_heading_that_stays_raw_is_found(check_text):
     assert problem.startswith("a heading is shown as raw text: A text.")
 
 
+def test_a_number_that_is_not_rounded_is_found(check_text):
+    page = "<p>0.123456789012</p><div class='a output'></div>"
+    page += '<div class="output highlight-text"><div class="highlight"><pre><span>{}</span></pre></div></div>'
+    assert list(check_text.unrounded_output(page.format("0.6768 [0.12345678]"))) == []
+    (problem,) = check_text.unrounded_output(page.format("0.676812345678912e-3"))
+    assert problem.endswith(": 0.676812345678912e-3")
+
+
 @pytest.mark.parametrize("line", ["One ends.  Another begins.", "A `name`.  Another.", "A text. ## A measurement"])
 def test_a_paragraph_that_begins_within_a_line_is_found(check_text, line):
     good_page = "## A heading\n\nA text. Another.\n\n```text\na.  b\n```\n\n| a.  | b |\n"
@@ -41,6 +49,19 @@ def test_code_wider_than_a_page_is_found(check_text, language):
     assert list(check_text.wide_code({"page.md": page.format(check_text.MAX_COLUMNS * "x")})) == []
     (problem,) = check_text.wide_code({"page.md": page.format((check_text.MAX_COLUMNS + 1) * "x")})
     assert "89 columns" in problem
+
+
+def test_code_of_an_example_wider_than_a_page_is_found(check_text):
+    example = f'"""\nTitle\n=====\n\n{100 * "w"}\n"""\n\n# {100 * "w"}\n{{}}\n'
+    assert list(check_text.wide_examples({"plot.py": example.format(check_text.MAX_COLUMNS * "x")})) == []
+    (problem,) = check_text.wide_examples({"plot.py": example.format((check_text.MAX_COLUMNS + 1) * "x")})
+    assert "89 columns" in problem
+
+
+def test_the_code_of_the_examples_fits_a_page(check_text):
+    examples = {file.name: file.read_text() for file in DOCS.parent.glob("examples/*/plot_*.py")}
+    assert len(examples) > 30
+    assert list(check_text.wide_examples(examples)) == []
 
 
 def test_the_check_of_the_sources_finds_each_kind(import_from_docs, tmp_path):
@@ -105,3 +126,20 @@ def test_text_that_a_narrow_screen_cuts_off_is_found(import_from_docs, tmp_path)
     with check_site.browser() as chromium:
         problems = check_site.check_pages(chromium, tmp_path)
     assert problems == ["wrong.html: cut off at 390 pixels: A sentence."]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("chromium"), reason="no Chromium on this machine")
+def test_a_picture_that_squeezes_text_is_found(import_from_docs, tmp_path):
+    check_site = import_from_docs("check_site")
+    page = (
+        "<meta name='viewport' content='width=device-width'><div class='bd-article'><img alt='A card' style='float: {}'"
+    )
+    page += (
+        " width='320' height='99' src='data:image/svg+xml,<svg xmlns=%22http://www.w3.org/2000/svg%22/>'><p>A text.</p>"
+    )
+    (tmp_path / "right.html").write_text(page.format("none"))
+    (tmp_path / "wrong.html").write_text(page.format("right"))
+    with check_site.browser() as chromium:
+        problems = check_site.check_pages(chromium, tmp_path)
+    assert [problem.partition(" a picture")[0] for problem in problems] == ["wrong.html: text squeezed beside"]

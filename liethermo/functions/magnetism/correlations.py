@@ -51,6 +51,7 @@ def structure_factor(spins, lattice: Lattice, wave_vectors=None) -> StructureFac
     spins : array, shape ``(..., *sites, 3)``
         One state, or samples to average over.
     lattice : Lattice
+        The lattice of the sites.
     wave_vectors : array, shape (..., 3), optional
         Wave vectors (1 / length); by default those of the periodic lattice, shape ``(*cells, 3)``, computed by a fast
         Fourier transform.
@@ -91,6 +92,7 @@ def dynamic_structure_factor(
     times : array, shape (times,)
         Evenly spaced times.
     lattice : Lattice
+        The lattice of the sites.
     wave_vectors : array, shape (..., 3), optional
         See :func:`structure_factor`.
     window : str

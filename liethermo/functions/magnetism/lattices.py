@@ -328,6 +328,7 @@ class Bonds:
     Attributes
     ----------
     lattice : Lattice
+        The lattice of the sites.
     first, second : array of int, shape (m,)
         Atoms of the basis at both ends.
     offsets : array of int, shape (m, d)

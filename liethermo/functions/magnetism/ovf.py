@@ -29,9 +29,11 @@ class VectorField(NamedTuple):
     origin : tuple of three floats
         Middle of the first cell.
     title : str
+        Title of the figure.
     unit : str
         Unit of the values.
     length_unit : str
+        Unit of the axes.
     """
 
     values: np.ndarray
@@ -50,6 +52,7 @@ def read_ovf(path) -> VectorField:
     Parameters
     ----------
     path : str or path
+        The file to read.
 
     Returns
     -------
@@ -101,6 +104,7 @@ def write_ovf(
     Parameters
     ----------
     path : str or path
+        The file to write.
     values : array, shape (nx, ny, nz, components)
         Such as ``system.spins(x)``; three components for version 1.
     size : float, or tuple of three floats

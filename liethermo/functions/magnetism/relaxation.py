@@ -32,10 +32,13 @@ class Minimum(NamedTuple):
     Attributes
     ----------
     spins : array, shape ``(*sites, 3)``
+        The spins at the minimum.
     energy : float
+        The energy there.
     torque : float
         Largest ``|s_i x grad_i H|``, relative to the largest ``|grad_i H|`` of a spin of the length of s_i.
     steps : int
+        Number of steps.
     """
 
     spins: np.ndarray
@@ -55,6 +58,7 @@ def minimise(energy, spins, tolerance: float = 1e-8, max_steps: int = 100_000) -
     Parameters
     ----------
     energy : Energy, list of energies, or function from the spins, shape ``(*sites, 3)``, to a scalar
+        The energy of the spins.
     spins : array, shape ``(*sites, 3)``
         The start; its lengths are kept.
     tolerance : float
@@ -160,9 +164,11 @@ class HysteresisLoop(NamedTuple):
     Attributes
     ----------
     fields : array, shape (n, 3)
+        The fields, in the order in which they were applied.
     magnetisation : array, shape (n, 3)
         Mean of the spins, weighted with their moments relative to the mean moment.
     spins : array, shape ``(n, *sites, 3)``
+        The spins at rest in each field.
     energies : array, shape (n,)
         Energies, with that in the field.
     """

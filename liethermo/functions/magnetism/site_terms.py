@@ -36,6 +36,7 @@ def anisotropy(sites, strength=1.0, axis=(0.0, 0.0, 1.0)) -> Energy:
     Parameters
     ----------
     sites : int, tuple of int or Lattice
+        Number of spins, or the shape of their lattice.
     strength : float, or array of the shape of the sites
         K_i.
     axis : array, shape (3,) or ``(*sites, 3)``
@@ -67,6 +68,7 @@ def uniaxial_anisotropy(sites, coefficients: Mapping, axis=(0.0, 0.0, 1.0)) -> E
     Parameters
     ----------
     sites : int, tuple of int or Lattice
+        Number of spins, or the shape of their lattice.
     coefficients : mapping from int to float, or to an array of the shape of the sites
         K_p (energy) by the power p >= 1, such as ``{2: K1, 4: K2, 6: K3}``.
     axis : array, shape (3,) or ``(*sites, 3)``
@@ -98,6 +100,7 @@ def cubic_anisotropy(sites, first=1.0, second=0.0, axes=None) -> Energy:
     Parameters
     ----------
     sites : int, tuple of int or Lattice
+        Number of spins, or the shape of their lattice.
     first, second : float, or array of the shape of the sites
         K1 and K2 (energy).
     axes : array, shape (3, 3) or ``(*sites, 3, 3)``, optional
@@ -128,6 +131,7 @@ def stevens_anisotropy(sites, coefficients: Mapping, axes=None) -> Energy:
     Parameters
     ----------
     sites : int, tuple of int or Lattice
+        Number of spins, or the shape of their lattice.
     coefficients : mapping from (int, int) to float, or to an array of the shape of the sites
         B_kq (energy) by (k, q), with k = 2, 4 or 6 and \|q\| <= k.
     axes : array, shape (3, 3) or ``(*sites, 3, 3)``, optional
@@ -157,6 +161,7 @@ def polynomial_anisotropy(sites, terms: Mapping, axes=None) -> Energy:
     Parameters
     ----------
     sites : int, tuple of int or Lattice
+        Number of spins, or the shape of their lattice.
     terms : mapping from (int, int, int) to float, or to an array of the shape of the sites
         The coefficients c_p (energy) by the powers of x, y and z.
     axes : array, shape (3, 3) or ``(*sites, 3, 3)``, optional
@@ -201,6 +206,7 @@ def zeeman(sites, field, moment=1.0) -> Energy:
     Parameters
     ----------
     sites : int, tuple of int or Lattice
+        Number of spins, or the shape of their lattice.
     field : array, shape (3,) or ``(*sites, 3)``; or function of the time to such an array
         B_i, which may depend on the time.
     moment : float, or array of the shape of the sites

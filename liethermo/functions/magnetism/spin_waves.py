@@ -37,6 +37,7 @@ def spin_wave_frequencies(
     energy : Energy or list of energies
         Of the spins of a periodic lattice.
     lattice : Lattice
+        The lattice of the sites.
     spins : array, shape ``(*sites, 3)``
         A state of rest, such as the spins of :func:`minimise`.
     wave_vectors : array, shape (..., 3)
@@ -187,9 +188,11 @@ def spin_temperature(energy, spins, sites) -> float:
     Parameters
     ----------
     energy : Energy or list of energies
+        The energy of the spins.
     spins : array, shape ``(..., *sites, 3)``
         One state, or samples of equilibrium, over which numerator and denominator are averaged.
     sites : int, tuple of int or Lattice
+        Number of spins, or the shape of their lattice.
 
     Returns
     -------

@@ -50,6 +50,7 @@ class Units(NamedTuple):
     Attributes
     ----------
     name : str
+        The name of the unit system.
     energy, time, length : str
         Names of the units. Fields are in tesla and temperatures in kelvin, except in reduced units.
     bohr_magneton : float

@@ -55,6 +55,7 @@ class LieVariational(OneStepMethod):
     Parameters
     ----------
     tau : {"cayley", "exp"}
+        The map from the algebra to the group.
     """
 
     systems = "Euler-Poincaré systems with entropy"

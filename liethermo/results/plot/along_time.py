@@ -33,6 +33,7 @@ def laws(solution: Solution, path: str | os.PathLike | None = None) -> Figure:
     Parameters
     ----------
     solution : Solution
+        The run to plot.
     path : path, optional
         Write the figure to this .pdf, .png or .svg file, and close it.
 
@@ -165,6 +166,7 @@ def projection(
     Parameters
     ----------
     solution : Solution
+        The run to plot.
     coordinates : sequence of 2 or 3 int, str or callable
         Components by their indices, counted from 0, or by the names of the basis elements; or functions of one state,
         such as an invariant.
@@ -219,6 +221,7 @@ def invariants(solution: Solution, system: System, path: str | os.PathLike | Non
     Parameters
     ----------
     solution : Solution
+        The run to plot.
     system : System
         The system that was integrated.
     path : path, optional

@@ -150,17 +150,22 @@ class _Quantity:
         return f"{self.name}{when} ${self.values[index]:.4g}$"
 
 
+SQUARED_NORM = "mu1**2 + mu2**2 + mu3**2"
+"""Name of the Casimir of so(3), the square of the length of the momentum."""
+
+
 def _conserved_and_changing(solution: Solution, system: System | None) -> tuple[_Quantity | None, _Quantity | None]:
     """Return energy and entropy, or their substitutes, as far as they are known; the conserved one first."""
     energy: PointFunction | None
     entropy: PointFunction | None
+    name = SQUARED_NORM
     if system is not None:
         energy = _vectorize_in_blocks(_restrict_to_body(system.energy, system))
         # the entropy of baths is no function of the body
         body_entropy = system.entropy if system.body_dim == system.dim else None
-        function = body_entropy or next(
-            (J for J, is_conserved in recorded_functions_with_verdicts(system).values() if is_conserved), None
-        )
+        functions = recorded_functions_with_verdicts(system).items()
+        name, function = next(((name, J) for name, (J, is_conserved) in functions if is_conserved), (name, None))
+        function = body_entropy or function
         entropy = None if function is None else _vectorize_in_blocks(_restrict_to_body(function, system))
     else:
         energy = _fit_quadric(solution.x) if solution.laws.energy == "conserved" else None
@@ -170,7 +175,7 @@ def _conserved_and_changing(solution: Solution, system: System | None) -> tuple[
     if entropy is not None and solution.entropy is not None:
         quantities[1] = _Quantity("entropy", entropy, solution.entropy)
     elif entropy is not None:
-        quantities[1] = _Quantity("invariant", entropy, entropy(solution.x))
+        quantities[1] = _Quantity(r"$|\mu|^2$" if name == SQUARED_NORM else name, entropy, entropy(solution.x))
     return (quantities[0], quantities[1]) if solution.laws.energy == "conserved" else (quantities[1], quantities[0])
 
 
@@ -390,6 +395,7 @@ def sphere_field(
     largest : float, optional
         The magnitude at which the colours end on both sides of zero; by default that of the values.
     title : str
+        Title of the figure.
 
     Raises
     ------

@@ -86,6 +86,7 @@ class Copies(Module):
     Parameters
     ----------
     count : int
+        Number of bodies.
     energy : function or Energy, or None
         From (q, p, S) in one array, shape (dim,), and the parameters of a body, to a scalar: with a heat capacity c,
         say, ``lambda x, c: c * jnp.exp(x[-1] / c)``. Or an Energy, the same for all. None where it is all in the
@@ -93,6 +94,7 @@ class Copies(Module):
     dim : int
         2n + 1 components of each; 1 for bodies at rest.
     parameters : array, shape (count, ...), or tuple of such
+        Parameters that differ from body to body, an entry for each.
     friction : optional
         Coefficients of linear friction (mass / time): a number, an array of shape (n,) for all, or (count, n). Or
         "contact": see :class:`Subsystem`.
@@ -258,6 +260,7 @@ class Reaction(Module):
     Parameters
     ----------
     body : int or str
+        Number or name of the body that reacts.
     stoichiometry : sequence of float
         nu, negative for what is used up: (-1, -1, 1) for A + B -> C.
     rate : float, >= 0, or function of the whole state to one

@@ -23,6 +23,7 @@ class Graph:
     Attributes
     ----------
     names : tuple of str
+        Names of the bodies.
     matrix : scipy.sparse.csr_array, shape (nodes, nodes)
         Symmetric: what :class:`liethermo.ComposedSystem` takes as a conductance.
     """
@@ -44,6 +45,7 @@ def read_graph(path: str | os.PathLike, weight: str = "conductance", nodes: Sequ
     Parameters
     ----------
     path : path
+        The file to read.
     weight : str
         The column or attribute with the weights.
     nodes : sequence of str, or int, optional

@@ -52,8 +52,8 @@ class ComposedSystem(System):
     Discretisations evaluate the Fourier factors ``K_ab = k_ab (1/T_a - 1/T_b)`` and the heat of friction with discrete
     temperatures and velocities, the components of the discrete gradient. So conduction alone gives
     ``S' - S = h sum_{a<b} k_ab (T_a - T_b)^2 / (T_a T_b) >= 0`` for every H, where SML Lemma 6.2 asks for a quadratic
-    one; likewise linear friction. A step on which a temperature is not positive is refused: the run stops with a status
-    that says so. (Contact friction is the exception: see :class:`EvolutionSystem` for what it asks of H_a.)
+    one. Linear friction has the same law. If a temperature is not positive in a step, the run stops with a status that
+    says so. (Contact friction is the exception: see :class:`EvolutionSystem` for what it asks of H_a.)
 
     Networks of 1e5 bodies are made of :class:`Copies`, with :class:`liethermo.Each` as the potential of what joins
     them. A step then costs as much as there are bodies and edges; a stiff one is solved by sparse Newton iteration.
@@ -61,6 +61,7 @@ class ComposedSystem(System):
     Parameters
     ----------
     subsystems : sequence of Subsystem or Copies, or dict of them by name
+        The bodies.
     coupling : function of q, of (q, S) or of (q, S, t), or an Energy of the whole state; or a sequence of such
         V, with q the positions of all subsystems in one array and S their entropies, shape (N,). Where bodies hold
         matter a function of three arguments is one of (q, S, N), all their particle numbers in one array. An Energy may
@@ -69,7 +70,7 @@ class ComposedSystem(System):
         Symmetric and >= 0 (power / temperature). In an edge, or for two bodies, it may be a function of the two
         temperatures (T_i, T_j), or of (T_i, T_j, x) with the whole state x, symmetric under exchange of the bodies; a
         step on which it is negative is refused.
-    drag : likewise
+    drag : array, shape (N, N), or SciPy sparse matrix; or sequence of (i, j, c); or a number for two bodies
         Coefficients c of friction between bodies with equally many degrees of freedom, ``-c_ij (v_i - v_j)`` on i, each
         heated by half (mass / time).
     conduction : {"discrete", "midpoint"}
@@ -77,10 +78,13 @@ class ComposedSystem(System):
         temperatures at the midpoint, as SML §6.2 prints them: then it is known to grow for quadratic energies alone,
         and no law of it is stated.
     membranes : sequence of Membrane
+        Membranes that particles pass.
     reactions : sequence of Reaction
+        Reactions within bodies.
     connected : bool
         Refuse a conductance whose graph falls into parts that exchange no heat.
     momentum_maps : dict of functions, or a sequence of them
+        Conserved quantities of a symmetry, functions of the state.
     validate : bool
         Test the axioms at a few random points. Turn off where an energy is not defined at normally distributed points,
         and use ``system.check(points=...)``.
@@ -210,8 +214,8 @@ class ComposedSystem(System):
         names = self.names
         clauses = [f"the temperature of {names[a]} is {T[a]:.4g}" for a in cold[:MAX_NAMED_BODIES]]
         if cold.size > MAX_NAMED_BODIES:
-            clauses.append(f"of {cold.size - MAX_NAMED_BODIES} more likewise")
-        return f"{' and '.join(clauses)}: it has to be positive"
+            clauses.append(f"{cold.size - MAX_NAMED_BODIES} more temperatures are not positive")
+        return f"{' and '.join(clauses)}; temperatures must be positive"
 
     @property
     def sparse_newton(self) -> SparseNewton:
@@ -408,8 +412,8 @@ def _require_connected(graph: Edges, names: tuple[str, ...]) -> None:
     if labels.max() > 0:
         examples = [" and ".join(np.array(names)[labels == i][:2]) for i in (0, 1)]
         raise InputError(
-            f"the conductance falls into {labels.max() + 1} parts that exchange no heat, such as that of {examples[0]} "
-            f"and that of {examples[1]}. If that is meant, say connected=False"
+            f"the conductance has {labels.max() + 1} parts that exchange no heat, such as those of {examples[0]} and "
+            f"of {examples[1]}. Use connected=False to allow this"
         )
 
 

@@ -274,7 +274,7 @@ def test_many_spins_conduct_component_by_component():
 
 
 BAD = {
-    "no baths": (lambda: _with(None, 0.1), "give the system baths"),
+    "no baths": (lambda: _with(None, 0.1), "Give the system baths"),
     "one bath": (lambda: _with(lt.HeatBaths(), 0.1), "number=2"),
     "a third bath": (lambda: _with(lt.HeatBaths(number=2), [(0, 2, 0.1)]), "number=3"),
     "a negative conductance": (lambda: _with(lt.HeatBaths(number=2), -0.1), ">= 0"),

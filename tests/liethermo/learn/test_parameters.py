@@ -335,7 +335,7 @@ BAD = {
         lambda: lt.learn.fit(lt.models.rigid_body(), (TIMES, np.ones((41, 3))), parameters={"energy.inertia": 1.0}),
         "energy.inertia must have shape (3,), got ()",
     ),
-    "no system": (lambda: fit_spring_with(lambda p: p), "must return a system, not dict"),
+    "no system": (lambda: fit_spring_with(lambda p: p), "must return a system, got dict"),
     "no parameter of observe": (
         lambda: fit_spring((TIMES, spring_record()), observe=lambda x, p: x[0] + p["offset"]),
         "observe uses the parameter 'offset', but the parameters are stiffness, drag",

@@ -162,7 +162,7 @@ def test_where_the_friction_is_decides_whether_a_slender_dual_spin_body_is_stabl
         (lambda: lt.models.damper_wheel(axis=(0, 0, 0)), "three numbers that are not all zero"),
         (lambda: lt.models.damper_wheel(friction=-1.0), "must be >= 0"),
         (lambda: lt.models.ring_damper(viscosity=0.0), "viscosity must be positive"),
-        (lambda: lt.models.dual_spin(capacity=(1.0, 2.0, 3.0)), "one number, or has shape"),
+        (lambda: lt.models.dual_spin(capacity=(1.0, 2.0, 3.0)), "a number or have shape"),
         (lambda: lt.models.dual_spin(rotor=-0.1), "must be positive"),
     ],
 )

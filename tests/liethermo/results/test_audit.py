@@ -166,7 +166,7 @@ def test_steps_that_do_not_resolve_the_motion(tmp_path):
     audit = solution.audit()
     assert only_row(audit, "accuracy").passed is False
     assert (audit.passed, audit.resolved) == (True, False)
-    assert "try suggest_step" in only_row(audit, "accuracy").note
+    assert "Try suggest_step" in only_row(audit, "accuracy").note
     assert "DO NOT RESOLVE" in str(audit).splitlines()[-1]
     assert [row.law for row in audit.rows if row.passed is False] == ["accuracy"]
     assert solution.audit(accuracy=np.inf).resolved

@@ -188,8 +188,8 @@ def test_the_energy_surface_is_found_from_the_states(body, relaxed_solution):
 
 def test_what_cannot_be_known_without_the_system_is_left_out(free_body):
     system, solution = free_body
-    assert labels(lt.plot.momentum_sphere(solution)) == ["invariant $0.98$", "start", "end"]
-    assert labels(lt.plot.momentum_sphere(solution, system)) == ["energy $0.6525$", "invariant $0.98$", "start", "end"]
+    assert labels(lt.plot.momentum_sphere(solution)) == [r"$|\mu|^2$ $0.98$", "start", "end"]
+    assert labels(lt.plot.momentum_sphere(solution, system)) == ["energy $0.6525$", r"$|\mu|^2$ $0.98$", "start", "end"]
 
 
 @pytest.mark.slow
@@ -197,7 +197,7 @@ def test_a_falling_energy_is_drawn_on_the_conserved_casimir():
     system = lt.LiePoissonSystem(mf.so(3), lt.Quadratic([0.1, 0.2, 1.0]), dissipation=lt.DoubleBracket(0.1))
     solution = lt.integrate(system, [0.1, 1.0, 0.5], (0.0, 10.0), 0.1)
     names = [label.split(" $")[0] for label in labels(lt.plot.momentum_sphere(solution, system))]
-    assert names == ["invariant", "energy at start", "energy at end", "start", "end"]
+    assert names == [r"$|\mu|^2$", "energy at start", "energy at end", "start", "end"]
     assert "energy at start" not in labels(lt.plot.momentum_sphere(solution))
 
 
@@ -317,7 +317,7 @@ def test_momentum_sphere_of_a_body_with_a_bath():
         mf.so(3), lt.Quadratic([1 / 3, 1 / 2, 1.0]), dissipation=lt.DoubleBracket(0.3), baths=lt.HeatBaths()
     )
     solution = lt.integrate(system, [0.1, 0.2, 1.0], (0.0, 20.0), 0.1)
-    assert labels(lt.plot.momentum_sphere(solution, system))[:2] == ["invariant $1.05$", "energy at start $0.5117$"]
+    assert labels(lt.plot.momentum_sphere(solution, system))[:2] == [r"$|\mu|^2$ $1.05$", "energy at start $0.5117$"]
     assert np.ptp(solution.energy) < 1e-14
     with pytest.raises(lt.InputError, match="If the others are the entropies of baths, pass the system too"):
         lt.plot.momentum_sphere(solution)

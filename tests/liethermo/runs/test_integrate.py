@@ -68,7 +68,7 @@ def test_runs_are_reproducible_and_pure():
 @pytest.mark.parametrize(
     ("x0", "words"),
     [
-        ([1.0, 2.0], r"shape \(3,\), not \(2,\)"),
+        ([1.0, 2.0], r"shape \(3,\), got \(2,\)"),
         ([[1.0, 2.0, 3.0]], r"\(1, 3\)"),
         ([1.0, np.nan, 0.0], r"component \(1,\) is nan"),
         ([1.0, np.inf, 0.0], "not finite"),

@@ -186,7 +186,7 @@ test_bad_arguments = refusal_test(
     (lambda: lt.Propagator(rigid_body(), None, -0.1).final(MU, SPAN), "step must be positive"),
     (lambda: lt.Propagator(rigid_body(), None, None).final(MU, SPAN), "step must be a number"),
     (lambda: lt.Propagator(rigid_body(), None, 0.1).final(MU, (1.0, 0.0)), "t_span must be finite and increasing"),
-    (lambda: lt.Propagator(rigid_body(), None, 0.1).final(MU[:2], SPAN), "a state of this system has shape"),
+    (lambda: lt.Propagator(rigid_body(), None, 0.1).final(MU[:2], SPAN), "a state of this system must have shape"),
     (lambda: lt.Propagator(rigid_body(), None, 0.1).final(MU * np.nan, SPAN), "the state is not finite"),
     (lambda: lt.Propagator(rigid_body(), lt.Reference(), 0.1).many(MU, SPAN), "runs single trajectories"),
 )

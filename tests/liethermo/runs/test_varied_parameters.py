@@ -212,7 +212,7 @@ def test_values_that_cannot_be_used_are_refused_as_before():
             propagator.final(MU, SPAN, parameters={"dissipation.rate": [0.7, 0.1]})
         with pytest.raises(lt.NonFiniteError, match="NaN or infinity"):
             propagator.final(MU, SPAN, parameters={"dissipation.rate": np.nan})
-        with pytest.raises(lt.InputError, match="a state of this system has shape"):
+        with pytest.raises(lt.InputError, match="a state of this system must have shape"):
             propagator.final(MU[:2], SPAN, parameters={"dissipation.rate": 0.4})
         with pytest.raises(lt.InputError, match="the state is not finite"):
             propagator.final(MU * np.nan, SPAN, parameters={"dissipation.rate": 0.4})

@@ -124,17 +124,17 @@ BAD = {
     "a finite capacity": (lambda: lt.HeatBaths(2.0, lambda t: 1.0 + t), "must be infinite"),
     "a vector of temperatures": (lambda: lt.HeatBaths(np.inf, lambda t: jnp.ones(2)), "must have shape"),
     "lists of different lengths": (lambda: lt.HeatBaths([1.0, 2.0], [1.0, 2.0, 3.0]), "of 3 baths"),
-    "no temperatures": (lambda: lt.HeatBaths(1.0, []), "positive integer, not 0"),
-    "too few temperatures": (lambda: lt.HeatBaths(1.0, [1.0], number=2), "entry for each"),
+    "no temperatures": (lambda: lt.HeatBaths(1.0, []), "positive integer, got 0"),
+    "too few temperatures": (lambda: lt.HeatBaths(1.0, [1.0], number=2), "must have one entry per bath, got 1"),
     "power without baths": (
         lambda: lt.SpinSystem(1, lt.magnetism.zeeman(1, (0, 0, 1.0)), power=lambda t: t),
-        "give baths",
+        "Give baths",
     ),
     "power as a number": (lambda: spin_in_a_bath(1.0, power=1.0), "function of the time"),
-    "power for two baths": (lambda: spin_in_a_bath(1.0, power=[None, lambda t: t]), "1 baths"),
+    "power for two baths": (lambda: spin_in_a_bath(1.0, power=[None, lambda t: t]), "1 entries, one per bath"),
     "temperatures without times": (
         lambda: (s := spin_in_a_bath(lambda t: 1.0 + t)).temperatures(s.state(START)),
-        "give the time beside the state",
+        "Give the time beside the state",
     ),
     "a pulse of no duration": (lambda: lt.magnetism.LaserPulse(1.0, 0.0), "positive"),
 }

@@ -399,9 +399,12 @@ def test_units():
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: lt.EvolutionSystem(jnp.sum, space="S2"), r"space must be a manifolds.Space.*not str"),
-        (lambda: lt.EvolutionSystem(jnp.sum, 5, space=mf.Sphere(2)), r"on S\^2 a state.*has 7 components, not 5"),
-        (lambda: lt.EvolutionSystem(jnp.sum), r"2n \+ 1 for n degrees of freedom, 3 at least, not None"),
+        (lambda: lt.EvolutionSystem(jnp.sum, space="S2"), r"space must be a manifolds.Space.*got str"),
+        (
+            lambda: lt.EvolutionSystem(jnp.sum, 5, space=mf.Sphere(2)),
+            r"on S\^2 .*must have 7 components, got dim=5",
+        ),
+        (lambda: lt.EvolutionSystem(jnp.sum), r"2n \+ 1 for n degrees of freedom, got None"),
         (lambda: lt.EvolutionSystem(jnp.sum, space=mf.SpecialUnitary(2)), r"SU\(2\) is complex"),
         (
             lambda: lt.integrate(flat(), [1.0, 0.0, 0.0], (0.0, 1.0), 0.1, V.midpoint(retraction="exp")),

@@ -311,7 +311,7 @@ def test_what_the_user_sees():
     K = SPIN.friction_matrix(SPIN_START, t)
     assert np.abs(K @ SPIN.at_time(t).energy.gradient(jnp.asarray(SPIN_START))).max() < 1e-15
     for call in (SPIN.vector_field, SPIN.entropy_production):
-        with pytest.raises(lt.InputError, match="give the time"):
+        with pytest.raises(lt.InputError, match="Give the time"):
             call(SPIN_START)
 
 

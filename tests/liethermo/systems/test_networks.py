@@ -274,7 +274,9 @@ def test_a_step_that_is_refused():
     solution = lt.integrate(system, x0, (0.0, 40.0), 4.0, on_failure="return", engine="sparse")
     assert not solution.status.ok
     assert solution.status.message
-    with pytest.raises(lt.InputError, match=r"temperature of odd 1 is -1.*odd 2.*odd 3.*of 1 more likewise"):
+    with pytest.raises(
+        lt.InputError, match=r"temperature of odd 1 is -1.*odd 2.*odd 3.*1 more temperatures are not positive"
+    ):
         lt.integrate(system, [1.0, -1.0, -1.0, -1.0, -1.0], (0.0, 1.0), 0.1)
 
 

@@ -194,5 +194,5 @@ def test_a_temperature_that_depends_on_time_has_its_conditions():
         lt.integrate(cold, cold.state(np.eye(2) / 2), (0.0, 1.0), 0.1)
     bath = lt.HeatBaths(np.inf, warm_and_cool)
     qubit = lt.QuantumSystem(np.diag([0.0, 1.0]), lt.ThermalJumps([(LOWER, 0.1)]), baths=bath)
-    with pytest.raises(lt.InputError, match="give the time beside the state"):
+    with pytest.raises(lt.InputError, match="Give the time beside the state"):
         qubit.temperatures(qubit.state(np.eye(2) / 2))

@@ -41,7 +41,7 @@ def test_a_matrix_is_a_state_whatever_its_numbers_are():
 
 def test_a_pure_state_is_refused_with_what_to_do():
     q = qubit()
-    with pytest.raises(lt.InputError, match="gradient of the entropy is infinite: mix it"):
+    with pytest.raises(lt.InputError, match="gradient of the entropy is infinite, and"):
         lt.integrate(q, q.state([0.0, 1.0]), (0.0, 1.0), 0.1)
     assert np.linalg.eigvalsh(q.density(q.state([0.0, 1.0], mixed=1e-6)))[0] == pytest.approx(5e-7)
 
@@ -54,15 +54,15 @@ def test_a_pure_state_with_a_floor_is_refused_where_steps_would_be_wrong():
     """Steepest ascent would let the error of a step grow, and jumps take an infinite gradient in implicit steps."""
     floor = lt.VonNeumann(floor=1e-12)
     q = lt.QuantumSystem(QUBIT, lt.SteepestEntropyAscent(0.4), entropy=floor)
-    with pytest.raises(lt.InputError, match=r"the Hamiltonian turns their eigenvectors.*mix it"):
+    with pytest.raises(lt.InputError, match=r"eigenvectors the Hamiltonian turns.*mixed=1e-6"):
         lt.integrate(q, q.state(PRECESSING_STATE), (0.0, 1.0), 0.1)
     still = lt.integrate(q, q.state([1.0, 0.0]), (0.0, 1.0), 0.1)
     assert np.abs(q.density(still.x[-1]) - np.diag([1.0, 0.0])).max() <= 1e-15
     dephasing = lt.QuantumSystem(QUBIT, lt.ThermalJumps([(Z, 0.3)]), entropy=floor)
-    with pytest.raises(lt.InputError, match=r"take lt\.MetriplecticRungeKutta"):
+    with pytest.raises(lt.InputError, match=r"or lt\.MetriplecticRungeKutta"):
         lt.integrate(dephasing, dephasing.state(PRECESSING_STATE), (0.0, 1.0), 0.1)
     for what in (lambda x: lt.flow(dephasing, x, (0.0, 1.0), 0.1), lambda x: lt.suggest_step(dephasing, x)):
-        with pytest.raises(lt.InputError, match=r"cannot start at this x0.*take lt\.MetriplecticRungeKutta"):
+        with pytest.raises(lt.InputError, match=r"cannot start at this x0.*or lt\.MetriplecticRungeKutta"):
             what(dephasing.state(PRECESSING_STATE))
     end = lt.integrate(dephasing, dephasing.state(PRECESSING_STATE), (0.0, 1.0), 0.1, lt.MetriplecticRungeKutta(8)).x[
         -1
@@ -85,7 +85,7 @@ def test_an_ensemble_refuses_what_a_single_run_refuses(driven):
         lt.integrate(q, x0s[3], (0.0, 0.2), 0.1)
     assert many.message(3) == f"trajectory 3: {one.value}"
     assert np.array_equal(many.x[4], lt.integrate(q, x0s[4], (0.0, 0.2), 0.1).x[-1])
-    with pytest.raises(lt.InputError, match=r"trajectory 0: the run cannot start.*take lt\.MetriplecticRungeKutta"):
+    with pytest.raises(lt.InputError, match=r"trajectory 0: the run cannot start.*or lt\.MetriplecticRungeKutta"):
         lt.ensemble(q, q.state(PRECESSING_STATE), (0.0, 0.2), 0.1)
     assert lt.ensemble(q, x0s, (0.0, 0.2), 0.1, lt.MetriplecticRungeKutta(4)).ok.all()
 
@@ -97,7 +97,7 @@ def test_an_ensemble_over_rates_refuses_the_states_of_their_members():
         qubit(), x0s, (0.0, 0.2), 0.1, parameters={"dissipation.rates[0]": np.array([0.1, 0.2, 0.3, 0.4])}
     )
     assert np.flatnonzero(~many.ok).tolist() == [2]
-    assert "gradient of the entropy is infinite: mix it" in many.message(2)
+    assert "gradient of the entropy is infinite, and" in many.message(2)
 
 
 SHIFTED_METHODS = [lt.MetriplecticRungeKutta(4), lt.MetriplecticMidpoint(), lt.MetriplecticGauss(2)]
@@ -306,7 +306,7 @@ def test_pure_states_run_by_methods_without_the_gradient_of_the_entropy(baths):
             assert z == pytest.approx((rho[0, 0] - rho[1, 1]).real, abs=1e-11)
         else:
             assert z == pytest.approx(rest - (1.0 + rest) * np.exp(-2.0 * fast), abs=1e-11)
-        with pytest.raises(lt.InputError, match=r"mix it.*take lt\.MetriplecticRungeKutta"):
+        with pytest.raises(lt.InputError, match=r"Use system.*or lt\.MetriplecticRungeKutta"):
             lt.integrate(q, [0.0, 1.0], (0.0, 2.0), 0.05, lt.MetriplecticMidpoint())
 
 
@@ -349,14 +349,14 @@ def test_the_advice_for_a_pure_state_under_steepest_ascent_works():
     q = lt.QuantumSystem(np.diag([0.0, 1.0, 2.5]), lt.SteepestEntropyAscent(0.4))
     state = np.diag([0.3, 0.7, 0.0]).astype(complex)
     with pytest.raises(
-        lt.InputError, match=r"infinite: mix it, .* or give the system entropy=lt\.VonNeumann\(floor=1e-12\)"
+        lt.InputError, match=r"infinite\. Use .* or give the system entropy=lt\.VonNeumann\(floor=1e-12\)"
     ):
         lt.integrate(q, state, (0.0, 1.0), 0.1)
     floor = lt.QuantumSystem(np.diag([0.0, 1.0, 2.5]), lt.SteepestEntropyAscent(0.4), entropy=lt.VonNeumann(1e-12))
     for system, start in ((floor, state), (q, q.state(state, mixed=1e-6))):
         assert lt.integrate(system, start, (0.0, 1.0), 0.1).audit().passed
     turned = lt.QuantumSystem(random_hermitian(3), lt.SteepestEntropyAscent(0.4))
-    with pytest.raises(lt.InputError, match=r"mix it, as in q\.state\(rho, mixed=1e-6\)$"):
+    with pytest.raises(lt.InputError, match=r"Use system\.state\(rho, mixed=1e-6\)$"):
         lt.integrate(turned, state, (0.0, 1.0), 0.1)
     assert lt.integrate(turned, turned.state(state, mixed=1e-6), (0.0, 1.0), 0.1).audit().passed
 
@@ -415,7 +415,9 @@ BAD = {
     "term 1 of the Hamiltonian has shape": lambda q: lt.QuantumSystem([QUBIT, (np.eye(3), jnp.cos)]),
     "term 1 of the Hamiltonian is a matrix, or a pair": lambda q: lt.QuantumSystem([QUBIT, (X, 0.5)]),
     "term 0 of the Hamiltonian is a matrix, or a pair": lambda q: lt.QuantumSystem([[X, 0.5], QUBIT]),
-    "of term 1 of the Hamiltonian gives a real number": lambda q: lt.QuantumSystem([QUBIT, (X, lambda t: 1j * t)]),
+    "of term 1 of the Hamiltonian must return a real number": lambda q: lt.QuantumSystem(
+        [QUBIT, (X, lambda t: 1j * t)]
+    ),
     "the Hamiltonian, where it is a function, is one of the time": lambda q: lt.QuantumSystem(lambda: QUBIT),
     "is one of the time t alone: missing .* 's'": lambda q: lt.QuantumSystem([QUBIT, (X, lambda t, s: t)]),
     r"V\[0\] with the energy 1.3 .* = 3.39e\+27": lambda q: lt.QuantumSystem(
@@ -443,10 +445,12 @@ BAD = {
         QUBIT, lt.ThermalJumps([(LOWER, 1.0)], bath=1), baths=infinite()
     ),
     "or remove baths=": lambda q: lt.QuantumSystem(QUBIT, baths=infinite()),
-    "lt.ThermalJumps or": lambda q: lt.QuantumSystem(QUBIT, lt.DoubleBracket(1.0)),
-    r"the rate of V\[0\] is a number, or a function .* not to": lambda q: lt.ThermalJumps([(LOWER, lambda w, T: [w])]),
+    "must be lt.ThermalJumps": lambda q: lt.QuantumSystem(QUBIT, lt.DoubleBracket(1.0)),
+    r"rate of V\[0\] must be a number >= 0, or a function .* got": lambda q: lt.ThermalJumps(
+        [(LOWER, lambda w, T: [w])]
+    ),
     "at omega = 1 and T = 1 it is -1": lambda q: lt.ThermalJumps([(LOWER, lambda w, T: -1.0)]),
-    r"to a number >= 0: .*positional argument": lambda q: lt.ThermalJumps([(LOWER, lambda w: 1.0)]),
+    r"that returns one: .*positional argument": lambda q: lt.ThermalJumps([(LOWER, lambda w: 1.0)]),
     r"got an array of float64, shape \(0, 0\)": lambda q: lt.QuantumSystem(np.zeros((0, 0))),
     "the observable must have shape": lambda q: q.expectation(q.state(RHO), np.eye(3)),
     "mixed, .* from 0 to 1, got 'half'": lambda q: q.state(RHO, mixed="half"),

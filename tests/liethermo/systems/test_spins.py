@@ -387,9 +387,9 @@ def test_control_a_correction_that_is_not_local_leaves_the_spheres(monkeypatch):
 
 CHAIN = [(0, 1, 1.0), (1, 2, 1.0)]
 REFUSED_CALLS = [
-    (lambda: small_lattice().state(np.zeros((3, 2))), r"spins in shape \(3, 3\), or all 10 components in one row"),
-    (lambda: small_lattice().state(np.zeros((4, 3))), r"spins in shape \(3, 3\)"),
-    (lambda: small_lattice().state(np.zeros(8)), "all 10 components"),
+    (lambda: small_lattice().state(np.zeros((3, 2))), r"\(3, 3\), or \(10,\) with all components in one row"),
+    (lambda: small_lattice().state(np.zeros((4, 3))), r"must have shape \(3, 3\)"),
+    (lambda: small_lattice().state(np.zeros(8)), r"\(10,\) with all components"),
     (lambda: mag.exchange(3, [(0, 1, 1.0), (1, 3, 1.0)]), r"the edge \(1, 3\) must join two of the 3 parts"),
     (lambda: mag.exchange(3, np.triu(np.ones((3, 3)), 1)), "the exchange must be symmetric"),
     (lambda: mag.exchange(3, np.ones((3, 3))), "of site 0 with itself"),
@@ -409,8 +409,8 @@ REFUSED_CALLS = [
     (lambda: lt.LandauLifshitz([0.1, -0.2]), "must be >= 0, got -0.2"),
     (lambda: small_lattice(bath=np.array([0, 0, 1])), "a dissipation heats bath 1, but there are 1 baths"),
     (lambda: small_lattice(bath=np.array([0, 0])), "of the shape .3,. of the sites"),
-    (lambda: lt.HeatBaths(-1.0), r"must be positive, not \[-1.0\]"),
-    (lambda: lt.HeatBaths([1.0, 2.0], number=1), r"1 baths is one number, or has shape \(1,\)"),
+    (lambda: lt.HeatBaths(-1.0), r"must be positive, got \[-1.0\]"),
+    (lambda: lt.HeatBaths([1.0, 2.0], number=1), r"1 baths must be a number or have shape \(1,\)"),
     (lambda: small_lattice(baths=2.0), "baths must be lt.HeatBaths, True"),
     (
         lambda: lt.LiePoissonSystem(mf.so(3), lambda s: s[0] ** 2, dissipation=lt.LandauLifshitz()),

@@ -174,7 +174,7 @@ def test_the_measure_of_an_algebra_that_is_not_unimodular():
     assert "unknown" in report.rows[-1].note
     report_with_density = lt.Fluctuations(1.0, seed=2, temperature=TEMPERATURE, density=weight).check(LINEAR)
     assert report_with_density.rows[-1].residual < 1e-10
-    with pytest.raises(ValueError, match="give a density"):
+    with pytest.raises(ValueError, match="Give a density"):
         check_equilibrium(LINEAR, BATH, [0.0, 1.0], 1.0, 0.1)
 
 

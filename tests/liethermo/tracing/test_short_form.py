@@ -23,7 +23,8 @@ BATHS = lt.HeatBaths(capacity=2.0, temperature=1.0)
         ({"a": 1.5}, "{a: 1.5}"),
         (lt.KillingDissipation(0.2), "KillingDissipation(rate=0.2)"),
         (lt.Quadratic(np.array([1.0, 2.0])), "Quadratic(A=[1, 2])"),
-        (BATHS, "HeatBaths(energy=BathEnergy(capacity=[2], temperature=[1]), number=1)"),
+        (BATHS, "HeatBaths(capacity=[2], temperature=[1])"),
+        (np.array([-0.0, 1.0]), "[0, 1]"),
     ],
     ids=str,
 )
@@ -35,7 +36,7 @@ def test_a_system_is_one_line_with_its_parameters():
     body = lt.LiePoissonSystem(mf.so(3), lt.Quadratic([1.0, 2.0, 3.0]), dissipation=lt.DoubleBracket(0.1), baths=BATHS)
     assert repr(body) == (
         "LiePoissonSystem(so(3), energy=Quadratic(A=[1, 2, 3]), dissipation=DoubleBracket(rate=0.1), "
-        "baths=HeatBaths(energy=BathEnergy(capacity=[2], temperature=[1]), number=1))"
+        "baths=HeatBaths(capacity=[2], temperature=[1]))"
     )
     assert str(body) == repr(body)
 

@@ -304,7 +304,7 @@ def test_two_rotations_of_irrational_ratio_have_two_functions():
     ("name", "parameters", "message"),
     [
         ("A6,1", {}, "name must be one of"),
-        ("A3,5", {}, r"has the parameters a, got none; write patera\('A3,5', a=…\)"),
+        ("A3,5", {}, r"has the parameters a, got none\. Write patera\('A3,5', a=…\)"),
         ("A3,1", {"a": 1.0}, "has no parameters"),
         ("A3,5", {"a": 1.0}, r"needs 0 < \|a\| < 1, got a=1"),
         ("A5,20", {"a": np.inf}, "must be finite"),

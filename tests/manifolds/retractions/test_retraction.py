@@ -166,7 +166,7 @@ def test_a_step_beyond_the_domain(R, limit):
     inner_length = 0.999 * limit
     x, y = R(z, direction, inner_length)
     assert is_close(R.inverse(x, y)[1], inner_length * direction, scale=1e3)
-    with pytest.raises(mf.DomainError, match=r"the step h v\[0\] is 1\.001 times as long .* take a smaller step"):
+    with pytest.raises(mf.DomainError, match=r"the step h v\[0\] is 1\.001 times as long .* Use a smaller step"):
         R(z, direction, 1.001 * limit)
     reach = jax.jit(R.reach)(z, direction, 1.001 * limit)  # how to ask under tracing, where nothing raises
     assert is_close(reach, 1.001)

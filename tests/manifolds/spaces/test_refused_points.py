@@ -82,7 +82,7 @@ def test_arrays_of_the_wrong_kind():
         space.from_coordinates(NORTH, [1.0, 2.0, 3.0])
     with pytest.raises(mf.ParameterError, match="n must be at least 1"):
         mf.Sphere(0)
-    with pytest.raises(mf.ParameterError, match="take SpecialOrthogonal"):
+    with pytest.raises(mf.ParameterError, match="use SpecialOrthogonal"):
         mf.Stiefel(3, 3)
     with pytest.raises(mf.ParameterError, match="length must be a positive number"):
         mf.SpecialEuclidean(3, -1.0)
