@@ -33,6 +33,7 @@ from .step_control import (
     StepControl,
     jacobian_probe,
     limit_next_step_by_growth_rate,
+    max_step_for_attitude,
     next_step_size_and_end,
     step_size_after_acceptance,
     step_size_after_rejection,
@@ -60,6 +61,8 @@ def initial_adaptive_state(
         (relative_rate > 0.0) & (norm > 0.0), jnp.minimum(span_length, estimated_step), 1e-3 * span_length
     )
     first_step = jnp.minimum(jnp.where(control.first_step > 0.0, control.first_step, estimated_step), control.max_step)
+    if control.adaptive:
+        first_step = jnp.minimum(first_step, max_step_for_attitude(method, system, x, relative_tolerance))
     probe = jacobian_probe(solved_system, components) if control.adaptive else jnp.zeros((1, 1))
     adaptive_state = AdaptiveState(
         state=state,
@@ -135,6 +138,10 @@ def accept_or_reject(
         optimal_step = h * jnp.maximum(error, 1e-12) ** -power
         accepted_step_size = step_size_after_acceptance(
             optimal_step, adaptive_state.optimal_step_size, h, next_step_size, power, control.max_step, method.explicit
+        )
+        relative_tolerance = control.allowed_error(norm) / jnp.where(norm > 0.0, norm, 1.0)
+        accepted_step_size = jnp.minimum(
+            accepted_step_size, max_step_for_attitude(method, system, new_state.x, relative_tolerance)
         )
         optimal_step = jnp.where(
             h < TRUNCATED_STEP_RATIO * next_step_size, adaptive_state.optimal_step_size, optimal_step

@@ -132,6 +132,9 @@ A fall from an unstable equilibrium then takes the right time, to a few thousand
 does not show this, because the deviation is not yet visible in the state.
 """
 
+MAX_ATTITUDE_ANGLE = 0.5 * math.pi
+"""Largest angle, in radians, by which an adaptive step turns an attitude. Rotation angles are unique below pi."""
+
 MIN_GROWTH_TO_FREQUENCY = 0.01
 """Smallest ratio of the growth rate of an oscillation to its frequency for which it limits the step.
 
@@ -291,16 +294,34 @@ def step_size_after_rejection(error, h, power) -> jax.Array:
 # -- growth rates -----------------------------------------------------------------------------------------------------
 
 
-def max_step_times_growth_rate_for_accuracy(method: OneStepMethod) -> float:
-    """Return the largest product of step size and growth rate at which growth is accurate to :data:`GROWTH_RATE_RTOL`.
+def max_step_times_rate(method: OneStepMethod, relative_error):
+    """Return the largest product of step size and rate at which a motion of that rate has this relative error.
 
     A step of a one-step method multiplies the solution of a linear equation of rate r by R(h r), instead of exp(h r).
-    Implicit methods damp or preserve what they do not resolve, so a long step can miss an instability. R is assumed to
-    be the diagonal Padé approximation of the method's order.
+    R is assumed to be the diagonal Padé approximation of the method's order.
     """
     s = max(1, method.order // 2)
     pade_constant = math.factorial(2 * s) * math.factorial(2 * s + 1) / math.factorial(s) ** 2
-    return (GROWTH_RATE_RTOL * pade_constant) ** (0.5 / s)  # ln R(z) / z = 1 +- z^2s / pade_constant + ...
+    return (relative_error * pade_constant) ** (0.5 / s)  # ln R(z) / z = 1 +- z^2s / pade_constant + ...
+
+
+def max_step_times_growth_rate_for_accuracy(method: OneStepMethod) -> float:
+    """Return the largest product of step size and growth rate at which growth is accurate to :data:`GROWTH_RATE_RTOL`.
+
+    Implicit methods damp or preserve what they do not resolve, so a long step can miss an instability.
+    """
+    return max_step_times_rate(method, GROWTH_RATE_RTOL)
+
+
+def max_step_for_attitude(method: OneStepMethod, system: System, x, relative_error) -> jax.Array:
+    """Return the largest step in which an attitude that turns steadily, at its rate at x, has this relative error.
+
+    Explicit methods follow rotation angles, which are exact in a steady turn: they only need the angles to be small.
+    """
+    rate = method.attitude_rate(system, x)
+    allowed_angle = jnp.inf if method.explicit else max_step_times_rate(method, relative_error)
+    angle = jnp.minimum(allowed_angle, MAX_ATTITUDE_ANGLE)
+    return jnp.where(rate > 0.0, angle / jnp.where(rate > 0.0, rate, 1.0), jnp.inf)
 
 
 def limit_next_step_by_growth_rate(method: OneStepMethod, adaptive_state: AdaptiveState, probe) -> AdaptiveState:

@@ -376,6 +376,10 @@ class TimeDependent(Energy, FunctionWithBreaks):
     def kink_times(self) -> tuple[float, ...]:
         return DeclaredTimes.from_tree(self.function).kinks
 
+    @property
+    def known_span(self) -> tuple[float, float]:
+        return DeclaredTimes.from_tree(self.function).known_span
+
     def at_time(self, t) -> Energy:
         return Function(FixedTimeFunction(self.function, jnp.asarray(t, dtype=jnp.float64)))
 

@@ -125,6 +125,11 @@ class FunctionWithBreaks(Module):
         """Times at which a derivative of the function jumps, as far as they depend on no parameter."""
         return ()
 
+    @property
+    def known_span(self) -> tuple[float, float]:
+        """First and last time at which the function is known; runs beyond them are refused."""
+        return -math.inf, math.inf
+
 
 class DeclaredTimes(NamedTuple):
     """Times at which functions of time in a pytree, such as a system, say that they are not smooth.
@@ -133,10 +138,13 @@ class DeclaredTimes(NamedTuple):
     ----------
     jumps, kinks : tuple of float
         Times at which a function, or one of its derivatives, jumps; in increasing order.
+    known_span : tuple of two floats
+        First and last time at which all functions are known.
     """
 
     jumps: tuple[float, ...]
     kinks: tuple[float, ...]
+    known_span: tuple[float, float] = (-math.inf, math.inf)
 
     @classmethod
     def from_tree(cls, tree: Any) -> DeclaredTimes:
@@ -144,7 +152,8 @@ class DeclaredTimes(NamedTuple):
         leaves = jax.tree_util.tree_leaves(tree, is_leaf=lambda node: isinstance(node, FunctionWithBreaks))
         functions = [leaf for leaf in leaves if isinstance(leaf, FunctionWithBreaks)]
         jumps, kinks = {t for f in functions for t in f.break_times}, {t for f in functions for t in f.kink_times}
-        return cls(tuple(sorted(jumps)), tuple(sorted(kinks)))
+        starts, ends = zip((-math.inf, math.inf), *(f.known_span for f in functions), strict=True)
+        return cls(tuple(sorted(jumps)), tuple(sorted(kinks)), (max(starts), min(ends)))
 
 
 TIMES_OF_SMOOTH_FUNCTIONS = DeclaredTimes((), ())
@@ -418,8 +427,10 @@ def kinks_of_table(times: jax.Array, is_smooth: bool) -> tuple[float, ...]:
     return tuple(np.asarray(times)[[0, -1] if is_smooth else slice(None)].tolist())
 
 
-class ContinuedSpline(Module):
-    """The polynomials of a spline of SciPy; the first and the last of them continue outside of its interval.
+class ContinuedSpline(FunctionWithBreaks):
+    """The polynomials of a spline of SciPy, for runs within its interval.
+
+    The first and the last polynomial continue outside, where a time lies by rounding.
 
     Attributes
     ----------
@@ -433,6 +444,11 @@ class ContinuedSpline(Module):
 
     def __init__(self, spline: Any):
         self.times, self.coefficients = _pieces_of_spline(spline)
+
+    @property
+    def known_span(self) -> tuple[float, float]:
+        start, *_, end = kinks_of_table(self.times, False) or (-math.inf, math.inf)
+        return start, end
 
     def __call__(self, t) -> jax.Array:
         i = interval_index(self.times, t)

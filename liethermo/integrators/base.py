@@ -159,6 +159,13 @@ class OneStepMethod(Module):
         """Return an estimate of the local error of a step, as a length like that of x; adaptive steps need it."""
         raise InputError(f"{self} has no error estimate: {self.why_fixed_step}")
 
+    def attitude_rate(self, system: System, x) -> jax.Array:
+        """Return the rate, in radians, at which an attitude moves that follows the steps; 0 if none does.
+
+        Its error is not in :meth:`error`, so this rate limits adaptive steps.
+        """
+        return jnp.zeros(())
+
     def residual_jvp(self, system: System, x, compensation, h, k) -> Callable:
         """Return the derivative of ``slopes - k`` by k, for Newton's method: a linear function of directions like k."""
         return jax.linearize(lambda k: self.slopes(system, x, compensation, h, k) - k, k)[1]

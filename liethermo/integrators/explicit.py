@@ -280,6 +280,8 @@ class ExplicitMethod(TransportingMethod):
         changes as the corrections of the others determine.
         """
 
+        momentum_dim = self._constant_momentum_dim(system)
+
         def clipped_drift(law: Law, gradient, level) -> jax.Array:
             scale = jnp.maximum(jnp.abs(level), law.function.sensitivity(x))
             drift = (level - law.function.value(x)) - jnp.dot(gradient, compensation)
@@ -299,7 +301,7 @@ class ExplicitMethod(TransportingMethod):
         )
 
         def gives_small_displacement(correction) -> jax.Array:
-            displacement = correction_displacement(system, x, correction, leaf)
+            displacement = correction_displacement(system, x, correction, leaf, momentum_dim)
             is_small = [
                 jnp.linalg.norm(displacement[b]) <= MAX_CORRECTION_DISPLACEMENT * jnp.linalg.norm(x[b])
                 for b in system.state_blocks
@@ -307,7 +309,7 @@ class ExplicitMethod(TransportingMethod):
             return jnp.stack(is_small).all()
 
         def achievable_changes() -> jax.Array:
-            directions = correction_directions(system, x, gradients, leaf, self._constant_momentum_dim(system))
+            directions = correction_directions(system, x, gradients, leaf, momentum_dim)
             correction = level_correction(system, directions, drifts, gives_small_displacement)
             return jnp.stack([jnp.dot(v, correction) for v in directions])
 

@@ -58,6 +58,9 @@ VANISHED_LENGTH = math.sqrt(MIN_SQUARED_NORM)
 REST_RTOL = 8.0 * EPS
 """Largest ``|Pi(x) dH|``, relative to |x| |dH|, that is rounding: no step along the leaf then changes H."""
 
+SMALL_MOMENTUM_RATIO = 1e-3
+"""Length of a momentum, relative to a state with wheels or joints, below which corrections move it less."""
+
 MIN_MEAN_GRADIENT = 0.5
 """Smallest length of the mean gradient of a step, relative to the gradient at its start.
 
@@ -112,7 +115,8 @@ def project_onto_levels(
 
     ``start_gradients`` are the gradients of the functions at x + compensation, ``target_changes`` the required changes.
     With ``leaf`` the displacement is along the symplectic leaf, and d is the covector that carries the state. The first
-    ``momentum_dim`` components are a momentum of constant length, which corrections leave at zero.
+    ``momentum_dim`` components are a momentum of constant length, which corrections leave at zero, and move less the
+    smaller it is.
 
     Near an equilibrium the entropy is almost the largest that the conserved functions allow. If a step overestimates
     the production, the levels may have no common point. Corrections along gradients that depend on each other would
@@ -125,8 +129,14 @@ def project_onto_levels(
     functions, blocks = [law.function for law in laws], system.state_blocks
 
     def corrected_displacement_and_residual(s: ProjectionState) -> tuple[jax.Array, jax.Array]:
-        d = s.d + correction_displacement(system, x + (compensation + s.d), s.correction, leaf)
+        d = s.d + correction_displacement(system, x + (compensation + s.d), s.correction, leaf, momentum_dim)
         return (d, jnp.zeros(())) if surface is None else surface.project_displacement(x, compensation, d)
+
+    def change_vectors_at(state, gradients) -> list[jax.Array]:
+        """Return the vectors whose products with a displacement are the changes of the functions."""
+        if leaf:
+            return [system.raise_index(state, v) for v in gradients]
+        return correction_directions(system, state, gradients)
 
     def largest_changes(change_vectors, d) -> jax.Array:
         """Return the largest change of each function in a displacement with the length of d in each block."""
@@ -176,7 +186,7 @@ def project_onto_levels(
         """
         end_state = x + (compensation + s.d)
         directions = correction_directions(system, end_state, end_gradients, leaf, momentum_dim)
-        change_vectors = [system.raise_index(end_state, v) for v in end_gradients] if leaf else directions
+        change_vectors = change_vectors_at(end_state, end_gradients)
         if len(blocks) == 1:
             lengths = jnp.stack([jnp.linalg.norm(v) for v in change_vectors])
         else:
@@ -295,11 +305,7 @@ def project_onto_levels(
     start_vectors: list[jax.Array] = []
     if work_direction is not None:
         begin = x + compensation
-        start_vectors = (
-            [system.raise_index(begin, v) for v in start_gradients]
-            if leaf
-            else correction_directions(system, begin, start_gradients, momentum_dim=momentum_dim)
-        )
+        start_vectors = change_vectors_at(begin, start_gradients)
     zero_residual = jnp.zeros(len(laws))
     start_d, start_correction = (jnp.zeros_like(d), -d) if leaf else (d, jnp.zeros_like(d))
     s = with_next_correction(
@@ -331,15 +337,12 @@ def correction_directions(
 ) -> list[jax.Array]:
     """Return the directions, along the surface, in which functions with these gradients at x are corrected.
 
-    With ``leaf`` they are directions of the covectors that carry the state along its leaf. A momentum of constant
-    length, the first ``momentum_dim`` components, has no directions at zero: the gradient of its length vanishes there,
-    so nothing else keeps a correction of the energy from moving it.
+    With ``leaf`` they are directions of the covectors that carry the state along its leaf. The first ``momentum_dim``
+    components are a momentum of constant length: see :func:`_momentum_weights`.
     """
     if momentum_dim:
-        n = system.body_dim
-        is_zero = jnp.linalg.norm(x[:momentum_dim]) <= REST_RTOL * jnp.linalg.norm(x[:n])
-        is_fixed = is_zero & (jnp.arange(x.shape[0]) < momentum_dim)
-        gradients = [jnp.where(is_fixed, 0.0, gradient) for gradient in gradients]
+        weights = _momentum_weights(system, x, momentum_dim)
+        gradients = [weights * gradient for gradient in gradients]
     if leaf:
         gradients = [_symplectic_leaf_direction(system, x, gradient) for gradient in gradients]
     directions, surface = [system.raise_index(x, gradient) for gradient in gradients], system.surface
@@ -363,12 +366,27 @@ def level_correction(
     return vector_with_inner_products(directions, changes, min(len(system.state_blocks), 2), is_usable)
 
 
-def correction_displacement(system: System, x, correction, leaf: bool = False) -> jax.Array:
+def correction_displacement(system: System, x, correction, leaf: bool = False, momentum_dim: int = 0) -> jax.Array:
     """Return the displacement of x by a correction: the correction itself, or along a leaf that of its covector.
 
     The covector is minus the correction: ``dH . Pi K = -(Pi dH) . K`` gives its sign.
     """
-    return system.poisson.leaf_displacement(x, -correction) if leaf else correction
+    if leaf:
+        return system.poisson.leaf_displacement(x, -correction)
+    return _momentum_weights(system, x, momentum_dim) * correction if momentum_dim else correction
+
+
+def _momentum_weights(system: System, x, momentum_dim: int) -> jax.Array:
+    """Return factors of the gradients and of a correction, shape (n,), for a momentum of constant length.
+
+    The first ``momentum_dim`` components are the momentum. Near zero the gradient of its length vanishes, so nothing
+    else keeps a correction of the energy from moving it by more than its own length. The factor of its components
+    falls with its length, to zero at zero.
+    """
+    momentum, state = (jnp.linalg.norm(x[:n]) for n in (momentum_dim, system.body_dim))
+    ratio = momentum / jnp.where(state > 0.0, state, 1.0)
+    weight = jnp.where(ratio <= REST_RTOL, 0.0, jnp.minimum(ratio / SMALL_MOMENTUM_RATIO, 1.0))
+    return jnp.where(jnp.arange(x.shape[0]) < momentum_dim, weight, 1.0)
 
 
 def project_implicit_step(

@@ -60,8 +60,9 @@ class WithAttitude(MethodWrapper):
     Explicit methods compute the impulse by a quadrature of their order; then the impulse and the attitude are
     corrected, by no more than the error of the step, so that the same holds.
 
-    The momenta are those of the inner method without attitudes, and the order is the same for all three
-    reconstructions.
+    For a given step the momenta are those of the inner method without attitudes, and the order is the same for all
+    three reconstructions. An attitude turns also where the momentum rests, as in a steady spin. Adaptive steps are
+    therefore limited by its rate: see :func:`.step_control.max_step_times_rate`.
 
     Attributes
     ----------
@@ -124,6 +125,11 @@ class WithAttitude(MethodWrapper):
         return self.method.error(
             system.body_at_attitude(x), system.points(x), system.points(compensation), h, system.points(k)
         )
+
+    def attitude_rate(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
+        """Return a bound of the moduli of the eigenvalues of ad(xi): for SO(3) 1.2 times the angular velocity."""
+        generator = system.group.algebra.ad(system.attitude_velocity(x))
+        return jnp.sqrt(jnp.sqrt(jnp.sum((generator @ generator) ** 2)))
 
     def initial_compensation(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
         mu, g = system.split_state(x)

@@ -288,6 +288,7 @@ def make_schedule(
     which states ``save_every`` saves.
     """
     start, end = checked_span(span, allow_infinite_end)
+    refuse_unknown_times(start, end, declared.known_span)
     step_size = end - start if isinstance(step, Adaptive) else checked_step(step, start, end)
     kinks = [t for t in declared.kinks if start < t < end]
     if not isinstance(step, Adaptive) and (save_every not in (None, 1) or len(kinks) * step_size > end - start):
@@ -302,6 +303,16 @@ def make_schedule(
         return schedule
     save_times = _save_times(save_at, start, end, breaks_inside)
     return StepSchedule((start, end), step_size, None, save_times, allow_infinite_end, breaks_inside)
+
+
+def refuse_unknown_times(start: float, end: float, known_span: tuple[float, float]) -> None:
+    """Raise InputError if a span goes beyond the times at which functions of time are known, by more than rounding."""
+    rounding = TIME_TOLERANCE_ULPS * EPS * max(abs(t) for t in (start, end, *known_span) if math.isfinite(t))
+    if start < known_span[0] - rounding or end > known_span[1] + rounding:
+        raise InputError(
+            f"t_span = ({start:g}, {end:g}) goes beyond the times of a coefficient that is an array, from "
+            f"{known_span[0]:g} to {known_span[1]:g}. Give its values for the whole span in times="
+        )
 
 
 def _save_times(save_at, start: float, end: float, breaks: tuple[float, ...]) -> np.ndarray:

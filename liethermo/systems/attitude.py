@@ -223,12 +223,17 @@ class AttitudeSystem(LiftedSystem):
     def inner(self) -> System:
         return self.body
 
-    def _vector_field(self, x):
-        (mu, g), body = self.split_state(x), self.body_at_attitude(x)
+    def attitude_velocity(self, x) -> jax.Array:
+        """Return the velocity xi of the attitude at a state, ``g' = g hat(xi)``, shape (group.dim,)."""
+        mu, body = self.points(x), self.body_at_attitude(x)
         dS = body.entropy_gradient(mu)
         xi = body.transport(mu, body.energy.gradient(mu), dS, tuple(L.gradient(mu) for L in body.preserved))
+        return xi[: self.group.dim]
+
+    def _vector_field(self, x):
+        (mu, g), body = self.split_state(x), self.body_at_attitude(x)
         p = body.external_torque(mu)[: self.group.dim] @ self.spatial_action(g) if self.impulse_dim else None
-        return self.join_state(body._vector_field(mu), g @ self.group.algebra.hat(xi[: self.group.dim]), p)
+        return self.join_state(body._vector_field(mu), g @ self.group.algebra.hat(self.attitude_velocity(x)), p)
 
     @property
     def _n_real_parts(self) -> int:

@@ -152,9 +152,13 @@ class LiePoissonSystem(TorqueSystem):
     @property
     def motion_quantities(self) -> MotionQuantities:
         parts = body_velocity_slices(self.algebra)
-        return MotionQuantities(
+        quantities = MotionQuantities(
             {name: lambda x, part=part: self.energy.gradient(x)[part] for name, part in parts.items()}
         )
+        if "rotor_rates" not in parts:
+            return quantities
+        rotors = parts["rotor_rates"]  # their momenta cancel that of the body in a momentum of the whole near zero
+        return quantities._replace(momentum_scale=lambda x: jnp.max(jnp.abs(x[rotors])))
 
     def state(
         self, x=None, batch: bool = False, *, angular_velocity=None, rotor_rates=None, temperature=None, t=None

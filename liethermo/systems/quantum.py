@@ -85,7 +85,7 @@ class QuantumSystem(System):
         Test the axioms at a few random points. They hold by form, whatever matrices are given.
     times : array, shape (points,), optional
         Increasing times (1 / energy) of the values of coefficients that are arrays, between which a cubic spline
-        interpolates. The first and the last cubic continue outside, so the times should cover those of a run.
+        interpolates. Runs beyond the first or the last of them are refused.
 
     Raises
     ------

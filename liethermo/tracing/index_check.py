@@ -114,8 +114,8 @@ def _uses_out_of_range_entries(closed_jaxpr: ClosedJaxpr) -> bool:
     if any(isinstance(c, jax.core.Tracer) for c in closed_jaxpr.consts):
         return True
     rng = np.random.default_rng(0)
-    point = [jnp.asarray(rng.uniform(0.5, 1.5, v.aval.shape), v.aval.dtype) for v in closed_jaxpr.jaxpr.invars]
-    with jax.ensure_compile_time_eval():
+    with jax.ensure_compile_time_eval():  # numbers, even where something else is traced
+        point = [jnp.asarray(rng.uniform(0.5, 1.5, v.aval.shape), v.aval.dtype) for v in closed_jaxpr.jaxpr.invars]
         results = _evaluate_with_nan_reads(closed_jaxpr.jaxpr, closed_jaxpr.consts, point)
         return any(bool(jnp.isnan(a).any()) for a in results if jnp.issubdtype(a.dtype, jnp.inexact))
 

@@ -90,6 +90,30 @@ def test_a_drive_in_qutips_form_is_that_of_dop853():
         np.testing.assert_allclose(system.density(run.x[-1]).ravel(), expected_values, atol=1e-9)
 
 
+def test_a_run_beyond_the_times_of_a_coefficient_is_refused():
+    """Its last cubic continued there without a word: a pulse that has decayed grew again."""
+
+    def qubit(times):
+        return lt.QuantumSystem([SZ, [SX, np.exp(-3.0 * times)]], times=times)
+
+    times, step = np.linspace(0.0, 0.3, 31), 0.05
+    short, long = qubit(times), qubit(np.linspace(-1.0, 2.0, 301))
+    x0 = np.asarray(short.state(RHO))
+    for run in (
+        lambda system, span: lt.integrate(system, x0, span, step, METHOD).x[-1],
+        lambda system, span: lt.integrate(system, x0, span, lt.Adaptive(1e-9), METHOD).x[-1],
+        lambda system, span: lt.ensemble(system, [x0, x0], span, step, METHOD).x[1],
+        lambda system, span: lt.Propagator(system, METHOD, step).final(x0, span),
+        lambda system, span: np.asarray(lt.flow(system, x0, span, step, METHOD)),
+    ):
+        for span in ((0.0, 0.5), (-0.2, 0.3)):
+            with pytest.raises(lt.errors.InputError, match=r"from 0 to 0\.3\. Give its values for the whole span"):
+                run(short, span)
+            assert np.isfinite(run(long, span)).all()
+        span = (0.0, 0.1 + 0.1 + 0.1)  # 0.3 and a rounding
+        np.testing.assert_allclose(run(short, span), run(long, span), atol=1e-6)
+
+
 @pytest.mark.slow
 def test_a_pure_state_does_not_lower_the_order():
     """From the ground state, where the gradient of the entropy is infinite, at order 6, beside ``mesolve``.

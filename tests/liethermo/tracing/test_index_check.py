@@ -147,6 +147,14 @@ ROLES = {
 }
 
 
+@pytest.mark.parametrize("make_table", [np.array, jnp.array])
+def test_a_table_of_indices_in_an_energy_is_refused_by_name(make_table):
+    """The energy is traced while something else is, and the check read a traced number then."""
+    with pytest.raises(IndexOutOfRangeError, match=r"the energy, .* has the index 3 of an axis with 3 entries"):
+        body(lambda m: jnp.sum(m[make_table([0, 3])]) ** 2)
+    body(lambda m: jnp.sum(jnp.where(NEIGHBOURS < 3, m[make_table(NEIGHBOURS)], 0.0) ** 2))
+
+
 @pytest.mark.parametrize("role", ROLES)
 def test_every_function_of_a_user_is_checked(role):
     make, message = ROLES[role]
