@@ -183,6 +183,38 @@ class SpinRingProgram:
         return x, record
 
 
+class HeunProgram:
+    """The algorithm of VAMPIRE in C, on a periodic cube of spins with exchange and an easy axis along z.
+
+    Parameters
+    ----------
+    edge : int
+        Number of spins along an edge.
+    exchange, axis, rate : float
+        Constants of the exchange, of the axis, and of the damping.
+    """
+
+    def __init__(self, edge: int, exchange: float, axis: float, rate: float):
+        self._library, self._parameters = compile_library("heun.c"), (exchange, axis, rate)
+        index = np.arange(edge**3, dtype=np.int32).reshape(edge, edge, edge)
+        shifted = [np.roll(index, shift, axis=a) for a in range(3) for shift in (1, -1)]
+        self._neighbours = np.ascontiguousarray(np.stack(shifted, axis=-1).reshape(-1, len(shifted)))
+
+    def integrate(self, spins, step: float, steps: int, temperature: float = 0.0) -> np.ndarray:
+        """Return the spins, shape (count, 3), after ``steps`` steps in a bath of this temperature."""
+        x, (exchange, axis, rate) = np.array(spins, dtype=float).reshape(-1, 3), self._parameters
+        amplitude = np.sqrt(2.0 * rate * temperature / ((1.0 + rate**2) * step))
+        self._library.integrate_heun(
+            _pointer(np.array([exchange, axis, rate, amplitude, self._neighbours.shape[1]])),
+            _pointer(x),
+            _pointer(self._neighbours),
+            ctypes.c_int64(len(x)),
+            ctypes.c_double(step),
+            ctypes.c_int64(steps),
+        )
+        return x
+
+
 @functools.cache
 def _build_folder() -> Path:
     folder = tempfile.TemporaryDirectory(prefix="liethermo-benchmarks-")

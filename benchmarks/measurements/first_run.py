@@ -71,6 +71,42 @@ lt.integrate(system, system.state(np.eye(20) / 20), (0.0, 1.0), 0.05, lt.Metripl
 }
 """Runs by name, and their code."""
 
+SPIN_COUNTS = (10, 1_000, 10_000, 100_000, 1_000_000)
+"""Numbers of spins of the first answers of magnets."""
+
+SPIN_METHODS = {
+    "explicit 4": "lt.MetriplecticRungeKutta(4)",
+    "midpoint": "lt.MetriplecticMidpoint()",
+    "midpoint, noise": "lt.MetriplecticMidpoint(), noise=lt.Fluctuations(seed=1)",
+}
+"""Methods of the first answers of magnets, and their code."""
+
+SPIN_CODE = """
+count, mag = {count}, lt.magnetism
+u = mag.units("meV")
+ring, mu = mag.lattice("chain", count, constant=2.5), u.moment(2.2)
+motion = u.gilbert(0.1, mu)
+energy = [mag.exchange(ring, 10.0), mag.anisotropy(ring, 0.1), mag.zeeman(ring, (0.0, 0.0, 1.0), mu)]
+bath = lt.HeatBaths(np.inf, u.thermal_energy(300.0))
+system = lt.SpinSystem(ring, energy, lt.LandauLifshitz(motion.rate), bath, ratio=motion.ratio)
+spins = np.random.default_rng(0).standard_normal((count, 3)) + np.array([0.0, 0.0, 2.0])
+spins /= np.linalg.norm(spins, axis=1, keepdims=True)
+lt.integrate(system, spins, (0.0, 0.005), 0.0005, {method}, save_every=10)
+"""
+"""Code of ten steps of a magnet in units of meV and ps."""
+
+SPIN_SCRIPT = """
+import time
+import numpy as np
+import liethermo as lt
+{run}
+print(time.process_time())
+"""
+"""Script of the first answer of a magnet, timed by the processor from the start of the process."""
+
+MAX_FIRST_SPIN_SECONDS = (3.0, 1.5)
+"""Maximum seconds of the first answer of a magnet, in a first and in a second process."""
+
 MAX_SECOND_PROCESS_SECONDS = 2.0
 """Maximum seconds of a second process."""
 
@@ -153,10 +189,11 @@ def run(is_quick: bool) -> Report:
         slowest_total = max(total for (_, which), total in totals.items() if which == name)
         targets.append(Target(f"first trajectory in a new process, {name}", max_seconds, slowest_total, "seconds"))
     processes, process_targets = _second_process_table(is_quick)
+    magnets, magnet_targets = _magnet_table(is_quick)
     flows, flow_targets = _flow_table(is_quick)
-    targets += process_targets + flow_targets
+    targets += process_targets + magnet_targets + flow_targets
     text = "From the start of the Python process to the end of its first trajectory; the slower system counts."
-    return Report("First trajectory", text, [table, processes, flows], targets)
+    return Report("First trajectory", text, [table, processes, magnets, flows], targets)
 
 
 def _second_process_table(is_quick: bool) -> tuple[Table, list[Target]]:
@@ -174,6 +211,28 @@ def _second_process_table(is_quick: bool) -> tuple[Table, list[Target]]:
         for name, _, second in rows
     ]
     return Table(caption, {"": "text", "First process": "seconds", "Second process": "seconds"}, rows), targets
+
+
+def _magnet_table(is_quick: bool) -> tuple[Table, list[Target]]:
+    """Return the times of the first answers of magnets in a first and a second process, and the targets."""
+    rows: list[list] = []
+    for method, code in list(SPIN_METHODS.items())[: 1 if is_quick else None]:
+        for count in SPIN_COUNTS[: 1 if is_quick else None]:
+            script = SPIN_SCRIPT.format(run=SPIN_CODE.format(count=count, method=code))
+            with tempfile.TemporaryDirectory() as cache:
+                first, *later = (float(child.run_python("-c", script, cache=cache)) for _ in range(3))
+            rows.append([method, count, first, min(later)])
+    columns = {"Method": "text", "Spins": "count", "First process": "seconds", "Second process": "seconds"}
+    caption = (
+        "Ten steps of a ring of spins with exchange, an easy axis and a field in a bath, in units of meV and ps: time "
+        "of the processor from the start of the process, imports included."
+    )
+    targets = [
+        Target(f"first answer of {SPIN_COUNTS[0]:,} to {rows[-1][1]:,} spins, {which} process", limit,
+               max(row[column] for row in rows), "seconds")
+        for which, limit, column in zip(("first", "second"), MAX_FIRST_SPIN_SECONDS, (2, 3), strict=True)
+    ]  # fmt: skip
+    return Table(caption, columns, rows), targets
 
 
 def _process_seconds(script: str, cache: str) -> float:

@@ -1,9 +1,10 @@
-"""Many spins with a bath: a step against a C program of the scheme, and the growth of time and memory."""
+"""Many spins: steps against C programs, with noise and with dipoles; growth of time and memory."""
 
 from __future__ import annotations
 
 import functools
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -12,8 +13,8 @@ import liethermo as lt
 from .. import child as process
 from .. import laws
 from ..contest import require_same_scheme
-from ..native import SpinRingProgram
-from ..report import Report, Table, Target, build_available, ratio
+from ..native import HeunProgram, SpinRingProgram
+from ..report import Report, Table, Target, UnavailableError, build_available, ratio
 from ..timing import race
 from .memory import PROCESS_STATUS_FILE, peak_resident_bytes
 
@@ -43,6 +44,18 @@ METHODS = {
 """Methods of the growth table."""
 THREADS = (1, 2)
 """Numbers of threads of the C program."""
+CUBE_EDGES = (10, 32)
+"""Spins along an edge of the cubes that are compared with the algorithm of VAMPIRE."""
+TEMPERATURE = 1.3
+"""Temperature of the bath of the cubes with noise, in units of the exchange."""
+DIPOLE_EDGES = (16, 32)
+"""Spins along an edge of the cubes with dipoles."""
+DIPOLE_STRENGTH = 0.1
+"""Strength of the dipoles, in units of the exchange."""
+MIN_CUBE_SPIN_STEPS = 800_000
+"""Minimum number of steps times spins of a timed run of a cube."""
+CUBE_ROUNDS = 4
+"""Number of timed rounds of a cube."""
 
 
 def run(is_quick: bool) -> Report:
@@ -93,11 +106,88 @@ def run(is_quick: bool) -> Report:
         text += (
             f" After {LONG_STEPS} steps the states differ by {require_same_scheme(float(difference), LONG_STEPS):.0e}."
         )
-    tables = [Table(caption, columns | laws.COLUMNS, rows), growth_table((1_000,) if is_quick else SIZES)]
+    dipoles = dipole_table((4,) if is_quick else DIPOLE_EDGES)
+    tables = [
+        Table(caption, columns | laws.COLUMNS, rows),
+        heun_table((4,) if is_quick else CUBE_EDGES),
+        dipoles,
+        growth_table((1_000,) if is_quick else SIZES),
+    ]
     c_row = f"C, {THREADS[-1]} threads"  # as many as the array engine may use
     time_ratio = ratio(seconds["array engine"], seconds.get(c_row))
-    target = Target("10⁵ coupled spins on two cores, a step against C on both", 3.0, time_ratio)
-    return Report("Many spins", text, tables, [target], skip_reasons)
+    targets = [
+        Target("10⁵ coupled spins on two cores, a step against C on both", 3.0, time_ratio),
+        *(
+            Target(f"dipoles on {edge}³ spins, {borders}, a step against one without", 3.0, dipole_ratio)
+            for edge, borders, _, _, dipole_ratio in dipoles.rows
+        ),
+    ]
+    return Report("Many spins", text, tables, targets, skip_reasons)
+
+
+def heun_table(edges) -> Table:
+    """Return the times of steps on cubes beside the algorithm of VAMPIRE in C, with and without noise."""
+    rows = []
+    for edge in edges:
+        for temperature in (0.0, TEMPERATURE):
+            spins = random_spins(edge**3)[:-1].reshape(edge, edge, edge, 3)
+            baths = lt.HeatBaths(np.inf, TEMPERATURE)
+            system = lt.models.spin_lattice((edge,) * 3, EXCHANGE, AXIS, rate=RATE, baths=baths)
+            noise = lt.Fluctuations(seed=1) if temperature else None
+            works: dict[str, Callable] = {
+                name: functools.partial(library_run, system, system.state(spins), method=METHODS[name], noise=noise)
+                for name in (("midpoint",) if temperature else ("midpoint", "explicit 4"))
+            }
+            try:
+                program = HeunProgram(edge, EXCHANGE, AXIS, RATE)
+                works["C"] = functools.partial(program.integrate, spins, STEP, temperature=temperature)
+            except UnavailableError:
+                pass
+            seconds = seconds_per_step(works, max(LONG_STEPS, MIN_CUBE_SPIN_STEPS // edge**3))
+            times = [seconds[name] / edge**3 if name in seconds else None for name in ("C", "explicit 4", "midpoint")]
+            rows.append([edge, "yes" if temperature else "no", *times])
+    columns = {"Edge": "count", "Noise": "text", "Heun in C": "seconds", "Explicit 4": "seconds", "Midpoint": "seconds"}
+    caption = (
+        f"A spin and step on periodic cubes with exchange and an easy axis, in a bath, steps of {STEP}. *Heun in C* is "
+        "the algorithm of VAMPIRE in one thread, of order 2, with two fields a step, and without a bath's energy. The "
+        "explicit method has order 4, and four fields a step besides those of the laws. Times of the processor."
+    )
+    return Table(caption, columns, rows)
+
+
+def dipole_table(edges) -> Table:
+    """Return the times of explicit steps on cubes with and without dipoles, and their ratio."""
+    rows = []
+    for edge in edges:
+        spins = random_spins(edge**3)[:-1].reshape(edge, edge, edge, 3)
+        for borders, is_periodic in (("open", False), ("periodic", True)):
+            lattice = lt.magnetism.lattice("sc", (edge,) * 3, periodic=is_periodic)
+            exchange = lt.magnetism.exchange(lattice, EXCHANGE)
+            both = exchange + lt.magnetism.dipoles(lattice, 1.0, DIPOLE_STRENGTH)
+            works = {}
+            for name, energy in (("without", exchange), ("with", both)):
+                system = lt.SpinSystem(lattice, energy, lt.LandauLifshitz(RATE))
+                x0 = system.state(spins)
+                works[name] = functools.partial(library_run, system, x0, method=METHODS["explicit 4"])
+            seconds = seconds_per_step(works, max(LONG_STEPS, MIN_CUBE_SPIN_STEPS // edge**3))
+            without, with_dipoles = (seconds[name] / edge**3 for name in ("without", "with"))
+            rows.append([edge, borders, without, with_dipoles, with_dipoles / without])
+    columns = {"Edge": "count", "Borders": "text", "Without": "seconds", "With dipoles": "seconds", "Ratio": "ratio"}
+    caption = f"A spin and step with exchange, with and without dipoles, explicit steps of {STEP} of order 4."
+    return Table(caption, columns, rows)
+
+
+def seconds_per_step(works: dict, steps: int) -> dict[str, float]:
+    """Return the processor seconds of a step of each work, a function of ``steps``, without the call itself."""
+    best_times = {name: [np.inf, np.inf] for name in works}
+    for turn in range(CUBE_ROUNDS + 1):  # the first one compiles
+        for name, work in works.items():
+            for i, count in enumerate((SHORT_STEPS, steps)):
+                start = time.process_time()
+                work(steps=count)
+                if turn:
+                    best_times[name][i] = min(best_times[name][i], time.process_time() - start)
+    return {name: (long - short) / (steps - SHORT_STEPS) for name, (short, long) in best_times.items()}
 
 
 def growth_table(sizes) -> Table:
@@ -151,9 +241,11 @@ def random_spins(count: int) -> np.ndarray:
     return np.append((s / np.linalg.norm(s, axis=1)[:, None]).ravel(), 0.0)
 
 
-def library_run(system: lt.SpinSystem, x0, steps: int, method: lt.OneStepMethod = METHODS["midpoint"]) -> lt.Solution:
+def library_run(
+    system: lt.SpinSystem, x0, steps: int, method: lt.OneStepMethod = METHODS["midpoint"], noise=None
+) -> lt.Solution:
     """Take ``steps`` steps and save the last state."""
-    return lt.integrate(system, x0, (0.0, steps * STEP), STEP, method, save_every=steps, engine="array")
+    return lt.integrate(system, x0, (0.0, steps * STEP), STEP, method, noise=noise, save_every=steps, engine="array")
 
 
 def stats_laws(solution: lt.Solution) -> laws.Laws:

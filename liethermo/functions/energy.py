@@ -191,7 +191,8 @@ class Energy(Module):
     def __add__(self, other) -> Energy:
         return Sum((*self.terms, *make_energy(other, "a term of a sum").terms))
 
-    __radd__ = __add__
+    def __radd__(self, other) -> Energy:
+        return self if type(other) is int and other == 0 else self + other  # the sum of a list begins with 0
 
     def __neg__(self) -> Energy:
         return Negative(self)

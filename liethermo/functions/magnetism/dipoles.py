@@ -139,8 +139,8 @@ class ConvolutionEnergy(SpinEnergy):
         s = jnp.moveaxis(s, -1, 1) if has_basis else s[:, None]
         fields = self.kernel.convolve(s)
         fields = jnp.moveaxis(fields, 1, -1) if has_basis else fields[:, 0]
-        factor = self.strength * self.moments
-        return factor * fields[0], factor * fields[1], factor * fields[2]
+        fx, fy, fz = (self.moments * (self.strength * fields[i]) for i in range(3))
+        return fx, fy, fz
 
     def multiple(self, factor) -> Energy:
         return ConvolutionEnergy(self.sites, self.axes, self.kernel, self.moments, factor * self.strength)
@@ -155,11 +155,14 @@ class FourierKernel(Module):
 
     Attributes
     ----------
-    transform : array, shape (6, atoms, atoms, *transformed cells), real or complex
+    components : tuple of six arrays, shape (atoms, atoms, *transformed cells), real or complex
+        The components xx, xy, xz, yy, yz, zz, in the order of axes of :meth:`_transform`. They are arrays of their own,
+        and real ones are not multiplied with complex modes: XLA would move slices or complex copies of them out of a
+        loop, one for each use, and then compute equal fields for each use.
     cells, padded_cells : tuple of int
     """
 
-    transform: jax.Array
+    components: tuple[jax.Array, ...]
     cells: tuple[int, ...] = eqx.field(static=True)
     padded_cells: tuple[int, ...] = eqx.field(static=True)
 
@@ -173,19 +176,39 @@ class FourierKernel(Module):
     def from_transform(cls, transform: np.ndarray, cells: tuple[int, ...], padded: tuple[int, ...]) -> FourierKernel:
         """Return the kernel of a transform, which is made real if each atom is a centre of inversion."""
         if np.abs(transform.imag).max() <= REAL_TOLERANCE * np.abs(transform).max():
-            transform = np.ascontiguousarray(transform.real)
-        return cls(jnp.asarray(transform), cells, padded)
+            transform = transform.real
+        transform = np.moveaxis(transform, 3 + transform_axes(padded)[-1], 3)
+        return cls(tuple(jnp.asarray(np.ascontiguousarray(part)) for part in transform), cells, padded)
 
     def convolve(self, s) -> jax.Array:
         """Return ``sum_j T(r_i - r_j) s_j``, for s of shape (3, atoms, *cells)."""
-        axes = transform_axes(self.padded_cells)
-        lengths, array_axes = [self.padded_cells[axis] for axis in axes], [2 + axis for axis in axes]
-        modes = jnp.fft.rfftn(s, lengths, axes=array_axes)
-        fields = jnp.stack(
-            [sum(jnp.sum(self.transform[PAIR_INDEX[i][j]] * modes[j], axis=1) for j in range(3)) for i in range(3)]
-        )
-        result = jnp.fft.irfftn(fields, lengths, axes=array_axes)
-        return result[(slice(None), slice(None), *(slice(n) for n in self.cells))]
+        modes = self._transform(s)
+        if jnp.iscomplexobj(self.components[0]):
+            return self._transform_back(self._multiply(modes))
+        return self._transform_back(jax.lax.complex(self._multiply(modes.real), self._multiply(modes.imag)))
+
+    def _multiply(self, modes) -> jax.Array:
+        """Return the product of the kernel with modes, both real or both complex, shape (3, atoms, *modes)."""
+        products = [[self.components[PAIR_INDEX[i][j]] * modes[j] for j in range(3)] for i in range(3)]
+        return jnp.stack([jnp.sum(x + y + z, axis=1) for x, y, z in products])
+
+    def _transform(self, s) -> jax.Array:
+        """Return the Fourier modes of s, with the last axis, which is transformed first, before the other ones.
+
+        So no transform of that axis has to pass over the zeros along the others, nor over strided memory.
+        """
+        *other_axes, last_axis = transform_axes(self.padded_cells)
+        modes = jnp.fft.rfft(s, self.padded_cells[last_axis], axis=2 + last_axis)
+        modes = jnp.moveaxis(modes, 2 + last_axis, 2)
+        return jnp.fft.fftn(modes, [self.padded_cells[axis] for axis in other_axes], [3 + axis for axis in other_axes])
+
+    def _transform_back(self, modes) -> jax.Array:
+        *other_axes, last_axis = transform_axes(self.padded_cells)
+        rows = jnp.fft.ifftn(modes, axes=[3 + axis for axis in other_axes])
+        rows = rows[(..., *(slice(n) for axis, n in enumerate(self.cells) if axis != last_axis))]
+        rows = jnp.moveaxis(rows, 2, 2 + last_axis)
+        fields = jnp.fft.irfft(rows, self.padded_cells[last_axis], axis=2 + last_axis)
+        return jax.lax.slice_in_dim(fields, 0, self.cells[last_axis], axis=2 + last_axis)
 
 
 REAL_TOLERANCE = 1e-15

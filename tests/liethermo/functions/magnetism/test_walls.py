@@ -90,3 +90,46 @@ def test_a_wall_above_walkers_field_turns_and_is_slower():
     assert velocity == pytest.approx(expected, rel=0.03)
     assert velocity < 0.6 * mobility() * wall_width(0.25 * math.pi) * B
     assert (np.diff(x) < 0.0).any()  # it even moves back
+
+
+ANGSTROM = {"SI": 1e-10, "meV": 1.0}
+"""One angstrom in the length of each system of units."""
+
+
+@pytest.mark.parametrize("name", ANGSTROM)
+def test_a_wall_of_atoms_has_its_width_in_units(name):
+    """``m_z = tanh(x / delta)`` with ``delta = a sqrt(J / 2 K)``, 55.9 angstrom; atoms change it by 0.03 %.
+
+    J is 300 k kelvin and K 0.3 k kelvin an atom, and a is 2.5 angstrom. The change is ``(a / delta)^2 / 6``.
+    """
+    mag, u = lt.magnetism, lt.magnetism.units(name)
+    J, K, a = u.thermal_energy(300.0), u.thermal_energy(0.3), 2.5 * ANGSTROM[name]
+    chain = mag.lattice("chain", 240, constant=a, periodic=False)
+    x = chain.positions[:, 0] - chain.positions[:, 0].mean()
+    start = np.zeros((240, 3))
+    start[:, 2] = np.clip(x / (40 * a), -1.0, 1.0)
+    start[:, 0] = np.sqrt(1.0 - start[:, 2] ** 2)
+    wall = mag.minimise([mag.exchange(chain, J), mag.anisotropy(chain, K)], start, 1e-9)
+    near = np.abs(x) < 20 * a
+    width = 1.0 / np.polyfit(x[near], np.arctanh(wall.spins[near, 2]), 1)[0]
+    assert width == pytest.approx(55.901699 * ANGSTROM[name], rel=6e-4)
+
+
+@pytest.mark.parametrize("name", ANGSTROM)
+def test_a_spiral_of_atoms_has_its_pitch_in_units(name):
+    """Spins turn by ``arctan(D / J)`` from one atom to the next, so the pitch is ``2 pi a / arctan(D / J)``.
+
+    J is 300 k kelvin and D 60 k kelvin a bond; a is 2.5 angstrom, and the pitch 79.6 angstrom. With D > 0 along x the
+    spins turn by the negative angle about x.
+    """
+    mag, u = lt.magnetism, lt.magnetism.units(name)
+    J, D, a = u.thermal_energy(300.0), u.thermal_energy(60.0), 2.5 * ANGSTROM[name]
+    chain = mag.lattice("chain", 64, constant=a, periodic=False)
+    angle = -2.0 * math.pi * np.arange(64) / 60.0  # too slow a turn
+    start = np.stack([0.1 * np.cos(7.0 * angle), np.cos(angle), np.sin(angle)], axis=-1)
+    start /= np.linalg.norm(start, axis=1, keepdims=True)
+    energy = [mag.exchange(chain, J), mag.dzyaloshinskii_moriya(chain.shell(1), [D, 0.0, 0.0])]
+    spiral = mag.minimise(energy, start, 1e-11)
+    turns = np.diff(np.unwrap(np.arctan2(spiral.spins[:, 2], spiral.spins[:, 1]))) / (2.0 * math.pi)
+    np.testing.assert_allclose(a / turns, -79.5760719 * ANGSTROM[name] * np.ones(63), rtol=1e-6)
+    np.testing.assert_allclose(spiral.spins[:, 0], 0.0, atol=1e-6)
