@@ -278,7 +278,8 @@ def covering(cases, keys: Callable) -> list:
     ``keys(*values)`` returns the keys of a case. Where they are pairs of its values, every value of one argument meets
     every value of another, which a product of three arguments does many times over.
     """
-    cases, chosen_indices, found_keys = list(cases), set(), set()
+    cases, chosen_indices = list(cases), set[int]()
+    found_keys: set = set()
     case_keys = [set(keys(*getattr(case, "values", case))) for case in cases]
     for least_new_count in range(max(map(len, case_keys)), 0, -1):
         for i, own_keys in enumerate(case_keys):

@@ -39,7 +39,7 @@ def compile_program(program: Program, lanes: int = 1):
         start = row_pointer(function.args[0], int(starts[i]) + indices[0])
         return Table(writer, writer.double_type, start=start, length=len(indices), stride=indices.step)
 
-    values = writer.write_as_doubles(program, read_input, find_table)
+    values = writer.write_program_with_double_outputs(program, read_input, find_table)
     for row, value in enumerate(itertools.chain.from_iterable(values)):
         build.store(value, row_pointer(function.args[1], row), align=8)
     build.ret_void()

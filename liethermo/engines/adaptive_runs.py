@@ -17,7 +17,7 @@ from ..tracing.programs import jit_cached
 from .adaptive_steps import (
     ATTEMPT_FIELDS,
     advance_adaptive,
-    advance_adaptive_with,
+    advance_adaptive_on_host,
     initial_adaptive_state,
     initial_adaptive_state_program,
 )
@@ -79,7 +79,7 @@ class ArrayAdaptiveRuns:
             lambda adaptive_state, newton: self._advance(adaptive_state, max_attempts, newton), self.adaptive_state
         )
 
-    def state(self) -> State:
+    def state_of_only_trajectory(self) -> State:
         """Return the state of the only trajectory."""
         return State(*(self.read(name)[0] for name in State._fields))
 
@@ -111,7 +111,7 @@ def start_adaptive_run(
 
     def advance_one(adaptive_state: AdaptiveState, max_attempts: int, newton: bool) -> AdaptiveState:
         if step is not None:
-            return advance_adaptive_with(step, system, method, control, adaptive_state, max_attempts)
+            return advance_adaptive_on_host(step, system, method, control, adaptive_state, max_attempts)
         return advance_adaptive(
             system, method, control, adaptive_state, jnp.asarray(max_attempts), DEFAULT_OPTIONS, newton
         )
@@ -180,9 +180,9 @@ EVENT_ZERO_ULPS = 2.0**10
 """Largest event value, in roundings of the event function, that counts as zero."""
 
 
-def _event_rounding(model: tuple[System, Any], time_and_state) -> jax.Array:
+def _event_rounding_scale(event_model: tuple[System, Any], time_and_state) -> jax.Array:
     """Return the rounding error scale of an event function at (t, x), including the rounding of x itself."""
-    (system, event_function), t, x = model, time_and_state[0], time_and_state[1:]
+    (system, event_function), t, x = event_model, time_and_state[0], time_and_state[1:]
     return propagated_rounding_scale(
         lambda y: event_function(system, t, y), x, jnp.maximum(jnp.abs(x), system.component_scales(x))
     )
@@ -192,9 +192,9 @@ DIFFERENCE_STEP = 1e-6
 """Relative step of the differences of an event function that cannot be traced."""
 
 
-def _rounding_by_differences(model: tuple[System, Any], time_and_state: np.ndarray) -> float:
+def _event_rounding_scale_by_differences(event_model: tuple[System, Any], time_and_state: np.ndarray) -> float:
     """Return the rounding error scale of an event function that cannot be traced, by that of x alone."""
-    (system, event_function), t, x = model, time_and_state[0], time_and_state[1:]
+    (system, event_function), t, x = event_model, time_and_state[0], time_and_state[1:]
     scales, directions = np.maximum(np.abs(x), system.component_scales(x)), np.random.default_rng(0)
     derivatives = []
     for _ in range(4):
@@ -351,9 +351,9 @@ class PauseHandler:
             in_group, model = np.isin(indices, group), (self.system_of(int(group[0])), self.control.event_functions[k])
             times_and_states = np.column_stack([self.adaptive_runs.read(name, group) for name in ("t", "x")])
             rounding_scales = (
-                np.array([_rounding_by_differences(model, row) for row in times_and_states])
+                np.array([_event_rounding_scale_by_differences(model, row) for row in times_and_states])
                 if model[1].calls_python
-                else evaluate_at_points(_event_rounding, model, times_and_states)
+                else evaluate_at_points(_event_rounding_scale, model, times_and_states)
             )
             is_zero[in_group] = magnitude[in_group] <= EVENT_ZERO_ULPS * EPS * np.where(
                 np.isnan(rounding_scales), np.inf, rounding_scales

@@ -34,7 +34,7 @@ from .step_control import (
     jacobian_probe,
     limit_next_step_by_growth_rate,
     max_step_for_attitude,
-    next_step_size_and_end,
+    next_step_size_and_end_time,
     step_size_after_acceptance,
     step_size_after_rejection,
 )
@@ -80,7 +80,7 @@ def initial_adaptive_state(
         max_relative_rate=relative_rate,
         growth_rate=zero,
         jacobian_probe=jnp.full_like(probe, jnp.nan),
-        root_bracket=jnp.zeros(root_bracket.search_array_shape(control.event_shape)),
+        root_bracket=jnp.zeros(root_bracket.packed_bracket_shape(control.event_shape)),
     )
     return limit_next_step_by_growth_rate(method, adaptive_state, probe) if control.adaptive else adaptive_state
 
@@ -94,7 +94,7 @@ def attempt_step(
     newton_fallback=None,
 ) -> AdaptiveState:
     """Return the adaptive state after one attempted step; ``newton_fallback`` as for :func:`.step.take_step`."""
-    h, time_after = next_step_size_and_end(control, adaptive_state)
+    h, time_after = next_step_size_and_end_time(control, adaptive_state)
     return accept_or_reject(
         system,
         method,
@@ -237,16 +237,16 @@ def apply_event_detection(
     function is a number again. The values at the end of a search are stored beside the empty bracket.
     """
     values_before, values = adaptive_state.event_values, control.event_values(system, outcome.time_after, new_state.x)
-    bracket, _ = root_bracket.split_search(adaptive_state.root_bracket)
+    bracket, _ = root_bracket.unpack_bracket_and_end_values(adaptive_state.root_bracket)
     signed_values = jnp.where(jnp.isnan(values) & jnp.isinf(values_before), values_before, values)
-    first_value = root_bracket.first_event_value(control.event_directions, values_before, signed_values)
+    first_value = root_bracket.value_of_first_event_function(control.event_directions, values_before, signed_values)
     is_searching = bracket.step_size > 0.0
     is_solved = (new_state.status == StatusCode.COMPLETED) & ~jnp.isnan(first_value)
     has_event = jnp.any(are_event_crossings(control, values_before, values))
     starts_search = outcome.is_accepted & has_event & ~is_searching
     is_shortened, first_fraction = jnp.zeros((), dtype=bool), jnp.ones(())
     if control.adaptive:
-        first_fraction, is_undone = first_sign_change_in_step(
+        first_fraction, is_undone = first_undone_sign_change_in_step(
             system, method, control, adaptive_state, h, new_state.k, values
         )
         is_shortened = outcome.is_accepted & is_undone & ~is_searching
@@ -277,13 +277,13 @@ def apply_event_detection(
             status,
         )
     initial_bracket = root_bracket.bracket_from_step(
-        h, *root_bracket.first_event_values_at_step_ends(control.event_directions, values_before, values)
+        h, *root_bracket.values_of_first_event_function_at_step_ends(control.event_directions, values_before, values)
     )
     end_values = jnp.where(ends_at_start, values_before, jnp.where(time_advances, signed_values, 0.0))
     updated_search = jnp.where(
         is_searching & ~has_failed & ~is_at_event,
-        root_bracket.search_array(next_bracket, jnp.zeros_like(values)),
-        root_bracket.search_array(root_bracket.EMPTY_BRACKET, jnp.where(is_at_event, end_values, 0.0)),
+        root_bracket.pack_bracket_and_end_values(next_bracket, jnp.zeros_like(values)),
+        root_bracket.pack_bracket_and_end_values(root_bracket.EMPTY_BRACKET, jnp.where(is_at_event, end_values, 0.0)),
     )
     return AttemptOutcome(
         is_accepted=jnp.where(
@@ -298,7 +298,9 @@ def apply_event_detection(
         status=status,
         n_rejected=jnp.where(is_searching, 1.0 * has_failed, jnp.where(is_shortened, 1.0, outcome.n_rejected)),
         root_bracket=jnp.where(
-            starts_search, root_bracket.search_array(initial_bracket, jnp.zeros_like(values)), updated_search
+            starts_search,
+            root_bracket.pack_bracket_and_end_values(initial_bracket, jnp.zeros_like(values)),
+            updated_search,
         ),
     )
 
@@ -310,7 +312,7 @@ def are_event_crossings(control: StepControl, values_before, values_after) -> ja
     return is_falling | ((values_before < 0.0) & (values_after >= 0.0) & (directions >= 0))
 
 
-def first_sign_change_in_step(
+def first_undone_sign_change_in_step(
     system: System, method: OneStepMethod, control: StepControl, adaptive_state: AdaptiveState, h, slopes, end_values
 ) -> tuple[jax.Array, jax.Array]:
     """Return the fraction of the first sign change in a step that a later one undoes, and whether there is one.
@@ -379,8 +381,8 @@ def advance_adaptive(
     return jax.lax.while_loop(continues, attempt_once, (adaptive_state, jnp.zeros((), dtype=jnp.int64)))[0]
 
 
-def advance_adaptive_with(
-    step: Callable,
+def advance_adaptive_on_host(
+    step_function: Callable,
     system: System,
     method: OneStepMethod,
     control: StepControl,
@@ -391,16 +393,16 @@ def advance_adaptive_with(
     for _ in range(max_attempts):
         if int(adaptive_state.state.status) != StatusCode.COMPLETED:
             break
-        h, time_after = _next_step_program(control, adaptive_state)
+        h, time_after = _next_step_size_and_end_time_program(control, adaptive_state)
         adaptive_state = _accept_or_reject_program(
-            system, method, control, adaptive_state, h, time_after, step(adaptive_state.state, h)
+            system, method, control, adaptive_state, h, time_after, step_function(adaptive_state.state, h)
         )
     return adaptive_state
 
 
 @jit_cached
-def _next_step_program(control, adaptive_state):
-    return next_step_size_and_end(control, adaptive_state)
+def _next_step_size_and_end_time_program(control, adaptive_state):
+    return next_step_size_and_end_time(control, adaptive_state)
 
 
 @jit_cached

@@ -25,7 +25,7 @@ def advance(
     method: OneStepMethod,
     state: State,
     h,
-    saves,
+    n_saves,
     save_every,
     capacity: int,
     options: SolverOptions = DEFAULT_OPTIONS,
@@ -33,10 +33,10 @@ def advance(
     newton: bool = True,
     first_step=None,
 ):
-    """Take ``save_every`` steps of size h, save, and repeat this ``saves`` times; stop at a failed step.
+    """Take ``save_every`` steps of size h, save, and repeat this ``n_saves`` times; stop at a failed step.
 
-    ``h``, ``saves <= capacity`` and ``save_every`` are arrays, so one program serves all values. Returns the new state
-    and four arrays with ``capacity`` rows: state vectors, energies, entropies, and whether the save was reached.
+    ``h``, ``n_saves <= capacity`` and ``save_every`` are arrays, so one program serves all values. Returns the new
+    state and four arrays with ``capacity`` rows: state vectors, energies, entropies, and whether the save was reached.
     ``noise`` has the increments of each step, shape (steps, increments), or is None. Without ``newton`` a step fails if
     fixed-point iteration does not solve its equations. A call that continues another one passes its ``first_step``, the
     number of the first step of that call: it takes the remaining steps and fills the remaining saves.
@@ -63,7 +63,7 @@ def advance(
     initial_values = state.x, state.energy, state.entropy, jnp.zeros((), bool)
     saved_arrays = tuple(jnp.zeros((capacity, *a.shape), a.dtype) for a in initial_values)
     # saves passes, not capacity passes
-    state, saved_arrays = jax.lax.fori_loop(0, saves, advance_to_save, (state, saved_arrays))
+    state, saved_arrays = jax.lax.fori_loop(0, n_saves, advance_to_save, (state, saved_arrays))
     return restore_order(state), saved_arrays
 
 
@@ -89,7 +89,7 @@ class LazyNewton:
         # Explicit methods have no equations, and a reference solver does not use Newton's method of this package.
         self.has_newton = not isinstance(method, OneStepMethod) or method.explicit
 
-    def advance(self, call: Callable, state: State, save_every) -> tuple[State, tuple]:
+    def advance_fixed_steps(self, call: Callable, state: State, save_every) -> tuple[State, tuple]:
         """Return ``call(state, with_newton, first_step)``, with Newton's method once a step needs it."""
         first_step = state.step
         state, saved = call(state, self.has_newton, first_step)
@@ -131,17 +131,17 @@ class ArrayEngine:
         """Return the state of a run that starts at x."""
         return initial_run_state_program(self.system, self.method, x)
 
-    def advance(self, state: State, h, saves: int, save_every: int, noise=None):
-        """Take ``save_every`` steps up to ``saves <= max_saves_per_call`` times: see :func:`advance`."""
+    def advance(self, state: State, h, n_saves: int, save_every: int, noise=None):
+        """Take ``save_every`` steps up to ``n_saves <= max_saves_per_call`` times: see :func:`advance`."""
         arguments = (
             jnp.asarray(h),
-            jnp.asarray(saves),
+            jnp.asarray(n_saves),
             jnp.asarray(save_every),
             self.max_saves_per_call,
             self.options,
             pad_noise_increments(noise),
         )
-        return self._lazy_newton.advance(
+        return self._lazy_newton.advance_fixed_steps(
             lambda s, *how: advance(self.system, self.method, s, *arguments, *how), state, save_every
         )
 
@@ -248,7 +248,7 @@ class ArrayBatch:
         capacity = 1 << (max(n_saves, self._min_capacity) - 1).bit_length()
         step_sizes = jnp.asarray(np.broadcast_to(np.asarray(h, dtype=np.float64), (self._n_trajectories,)))
         arguments = jnp.asarray(n_saves), jnp.asarray(steps_per_save), capacity, pad_noise_increments(noise)
-        self._state, saved_fields = self._lazy_newton.advance(
+        self._state, saved_fields = self._lazy_newton.advance_fixed_steps(
             lambda state, *how: _advance_batch(*self._arguments, state, step_sizes, *arguments, *how),
             self._state,
             steps_per_save,

@@ -42,23 +42,23 @@ EMPTY_BRACKET = RootBracket(*np.zeros(len(RootBracket._fields)))
 """Bracket without a root."""
 
 
-def search_array_shape(event_shape: tuple[int]) -> tuple[int]:
-    """Return the shape of the array that :func:`search_array` makes for event values of ``event_shape``."""
+def packed_bracket_shape(event_shape: tuple[int]) -> tuple[int]:
+    """Return the shape of a bracket and event values of shape ``event_shape``, packed into one array."""
     return (len(RootBracket._fields) + event_shape[0],)
 
 
-def search_array(bracket: RootBracket, end_values) -> jax.Array:
+def pack_bracket_and_end_values(bracket: RootBracket, end_values) -> jax.Array:
     """Pack the fields of a bracket, and the event values where the search ended, into one array."""
     return jnp.concatenate([jnp.stack([jnp.zeros(()) + value for value in bracket]), end_values])
 
 
-def split_search(array) -> tuple[RootBracket, Any]:
-    """Unpack the bracket and the event values that :func:`search_array` has packed."""
+def unpack_bracket_and_end_values(packed) -> tuple[RootBracket, Any]:
+    """Unpack the bracket and the event values that :func:`pack_bracket_and_end_values` has packed."""
     n_fields = len(RootBracket._fields)
-    return RootBracket(*array[:n_fields]), array[n_fields:]
+    return RootBracket(*packed[:n_fields]), packed[n_fields:]
 
 
-def first_event_value(directions: tuple[int, ...], values_before, values) -> jax.Array:
+def value_of_first_event_function(directions: tuple[int, ...], values_before, values) -> jax.Array:
     """Return, at a point of a step, the value of one function whose first zero in the step is the first event.
 
     It is the only event function, or the minimum of them, each divided by its value at the start of the step. Functions
@@ -73,17 +73,17 @@ def first_event_value(directions: tuple[int, ...], values_before, values) -> jax
     return jnp.min(jnp.where(can_cross, values / scale, 1.0))
 
 
-def first_event_values_at_step_ends(
+def values_of_first_event_function_at_step_ends(
     directions: tuple[int, ...], values_before, values_after
 ) -> tuple[jax.Array, jax.Array]:
-    """Return :func:`first_event_value` at the start and at the end of a step in which an event happens.
+    """Return :func:`value_of_first_event_function` at the start and at the end of a step in which an event happens.
 
     Functions that are NaN at the end are left out.
     """
     if len(directions) == 1:
         return values_before[0], values_after[0]
     values_after = jnp.where(jnp.isnan(values_after), values_before, values_after)
-    return jnp.ones(()), first_event_value(directions, values_before, values_after)
+    return jnp.ones(()), value_of_first_event_function(directions, values_before, values_after)
 
 
 def bracket_from_step(step_size, value_before, value_after) -> RootBracket:

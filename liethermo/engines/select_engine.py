@@ -129,9 +129,11 @@ class EngineWithFallback:
             trajectory = EngineTrajectory(self._engine, self._to_array_state(trajectory.state))
             return trajectory, trajectory.advance(h, n_saves, steps_per_save, noise)
 
-    def advance(self, state: State, h, saves: int, save_every: int) -> tuple[State, tuple]:
-        noise = self._noise_increments(state, int(saves) * int(save_every), h)
-        return self._call_with_fallback(lambda engine, state: engine.advance(state, h, saves, save_every, noise), state)
+    def advance(self, state: State, h, n_saves: int, save_every: int) -> tuple[State, tuple]:
+        noise = self._noise_increments(state, int(n_saves) * int(save_every), h)
+        return self._call_with_fallback(
+            lambda engine, state: engine.advance(state, h, n_saves, save_every, noise), state
+        )
 
     def step(self, state: State, h) -> State:
         noise = self._noise_increments(state, 1, h)

@@ -27,7 +27,7 @@ from .array_engine import EngineTrajectory
 from .solver_options import DEFAULT_OPTIONS
 from .stage_solver import IterationState, StageEquations, StageSolution, best_guess_and_residual, solve_fixed_point
 from .status_codes import StatusCode
-from .step import State, finish_step, initial_run_state_program, stage_equations, start_step
+from .step import State, finish_step, initial_run_state_program, stage_equations, system_and_state_at_step_start
 
 MAX_FRONT_WIDTH = 1_000
 """Largest width of a level of a breadth-first search for which a matrix is factorised.
@@ -243,11 +243,11 @@ class SparseEngine:
     def initial_run_state(self, x) -> State:
         return initial_run_state_program(self.system, self.method, x)
 
-    def advance(self, state, h, saves, save_every, noise=None):
-        """Take ``save_every`` steps up to ``saves`` times; the saved arrays have only the saves that were reached."""
+    def advance(self, state, h, n_saves, save_every, noise=None):
+        """Take ``save_every`` steps up to ``n_saves`` times; the saved arrays have only the saves that were reached."""
         del noise  # this engine takes no steps with noise
         saved_states: list[State] = []
-        for _ in range(int(saves)):
+        for _ in range(int(n_saves)):
             for _ in range(int(save_every)):
                 state = self.step(state, h)
                 if int(state.status) != StatusCode.COMPLETED:
@@ -311,7 +311,11 @@ class SparseEngine:
                 needs_jacobian = bool(
                     s.update > SPARSE_SOLVER_OPTIONS.jacobian_contraction_limit * s.previous_update
                 ) and float(s.update) > SPARSE_SOLVER_OPTIONS.plateau_rtol * float(scale)
-            if int(s.n_stalled) >= 2 and not slope_rounding and not bool(s.is_at_plateau(scale, SPARSE_SOLVER_OPTIONS)):
+            if (
+                int(s.n_stalled) >= 2
+                and not slope_rounding
+                and not bool(s.is_update_at_rounding_plateau(scale, SPARSE_SOLVER_OPTIONS))
+            ):
                 slope_rounding = _residual_rounding_scale(self.system, self.method, state.x)
         is_finite = bool(jnp.isfinite(residual).all())
         return StageSolution(
@@ -321,16 +325,16 @@ class SparseEngine:
             residual=s.update,
             fixed_point_iterations=jnp.asarray(n_fixed_point),
             newton_iterations=s.n_iterations,
-            slope_rounding=jnp.where(s.is_at_plateau(scale, SPARSE_SOLVER_OPTIONS), 0.0, slope_rounding),
+            slope_rounding=jnp.where(
+                s.is_update_at_rounding_plateau(scale, SPARSE_SOLVER_OPTIONS), 0.0, slope_rounding
+            ),
         )
 
     @staticmethod
     def _has_converged(s: IterationState, scale, residual, slope_rounding) -> bool:
         is_at_limit = s.n_iterations >= SPARSE_SOLVER_OPTIONS.max_newton_iterations
         residual_norm = jnp.max(jnp.abs(residual))
-        return bool(
-            s.has_converged_or_ended_small(is_at_limit, scale, SPARSE_SOLVER_OPTIONS, residual_norm, slope_rounding)
-        )
+        return bool(s.has_newton_converged(is_at_limit, scale, SPARSE_SOLVER_OPTIONS, residual_norm, slope_rounding))
 
     def _damped_newton_step(
         self, state, h, s: IterationState, residual, scale, inverse: SparseInverse, max_trials: int
@@ -379,7 +383,7 @@ def _solve_fixed_point_program(system: System, method: OneStepMethod, state: Sta
 
 
 def _stage_equations(system: System, method: OneStepMethod, state: State, h) -> StageEquations:
-    system, x = start_step(system, state.x, state.energy)
+    system, x = system_and_state_at_step_start(system, state.x, state.energy)
     return stage_equations(
         system, method, x, state.compensation, h, state.k, state.previous_slopes, SPARSE_SOLVER_OPTIONS
     )
@@ -387,7 +391,7 @@ def _stage_equations(system: System, method: OneStepMethod, state: State, h) -> 
 
 @jit_cached
 def _finish_step_program(system: System, method: OneStepMethod, state: State, h, solution: StageSolution) -> State:
-    system, x = start_step(system, state.x, state.energy)
+    system, x = system_and_state_at_step_start(system, state.x, state.energy)
     return finish_step(system, method, state._replace(x=x), h, solution, SPARSE_SOLVER_OPTIONS)
 
 

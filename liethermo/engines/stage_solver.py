@@ -70,7 +70,7 @@ class IterationState(NamedTuple):
         smallest_update = jnp.where(update < self.smallest_update, update, self.smallest_update)
         return IterationState(k, update, smallest_update, n_stalled, self.update, earlier_update, self.n_iterations + 1)
 
-    def is_slower_than(self, rate: float) -> jax.Array:
+    def shrinks_slower_than(self, rate: float) -> jax.Array:
         """Return whether updates shrink by less than ``rate``, in the last iteration and in the last two together.
 
         Two components that drive each other, such as spins and the bath that they heat, are each corrected in every
@@ -78,7 +78,7 @@ class IterationState(NamedTuple):
         """
         return (self.update > rate * self.previous_update) & (self.update > rate * rate * self.earlier_update)
 
-    def is_small(self, scale, options: SolverOptions, residual_norm=None, slope_rounding=None) -> jax.Array:
+    def is_update_small(self, scale, options: SolverOptions, residual_norm=None, slope_rounding=None) -> jax.Array:
         """Return whether the update is as small relative to ``scale`` as rounding may leave it.
 
         With ``slope_rounding``, a residual that is small relative to it will do instead.
@@ -88,27 +88,29 @@ class IterationState(NamedTuple):
             is_small |= residual_norm <= options.plateau_rtol * slope_rounding
         return is_small
 
-    def is_at_plateau(self, scale, options: SolverOptions, residual_norm=None, slope_rounding=None) -> jax.Array:
+    def is_update_at_rounding_plateau(
+        self, scale, options: SolverOptions, residual_norm=None, slope_rounding=None
+    ) -> jax.Array:
         """Return whether the update is negligible, or small and stalled twice (the rounding plateau)."""
-        is_small = self.is_small(scale, options, residual_norm, slope_rounding)
+        is_small = self.is_update_small(scale, options, residual_norm, slope_rounding)
         return (self.update <= options.update_floor * scale) | ((self.n_stalled >= 2) & is_small)
 
-    def has_converged_or_ended_small(
+    def has_newton_converged(
         self, is_at_limit, scale, options: SolverOptions, residual_norm, slope_rounding
     ) -> jax.Array:
         """Return whether a Newton iteration has converged; at its limit the update may still shrink below rounding."""
         criteria = scale, options, residual_norm, slope_rounding
-        return self.is_at_plateau(*criteria) | (is_at_limit & self.is_small(*criteria))
+        return self.is_update_at_rounding_plateau(*criteria) | (is_at_limit & self.is_update_small(*criteria))
 
-    def has_converged_and_continues(self, scale, options: SolverOptions) -> tuple[jax.Array, jax.Array]:
+    def has_fixed_point_converged_and_continues(self, scale, options: SolverOptions) -> tuple[jax.Array, jax.Array]:
         """Return whether a fixed-point iteration has converged, and whether it goes on."""
         is_slow = (
             (self.n_iterations >= 3)
-            & self.is_slower_than(options.fixed_point_contraction_limit)
+            & self.shrinks_slower_than(options.fixed_point_contraction_limit)
             & (self.smallest_update > options.plateau_rtol * scale)
         )
         is_finite = jnp.isfinite(self.update)
-        at_plateau = self.is_at_plateau(scale, options)
+        at_plateau = self.is_update_at_rounding_plateau(scale, options)
         return at_plateau & is_finite, ~at_plateau & ~is_slow & is_finite & (
             self.n_iterations < options.max_fixed_point_iterations
         )
@@ -119,7 +121,7 @@ def solve_fixed_point(equations: StageEquations, options: SolverOptions = DEFAUL
 
     def iterate(carry):
         s = carry[0].next_state(equations.slopes(carry[0].k), options)
-        return s, *s.has_converged_and_continues(equations.scale(s.k), options)
+        return s, *s.has_fixed_point_converged_and_continues(equations.scale(s.k), options)
 
     initial_carry = IterationState.initial(equations.guess), jnp.asarray(False), jnp.asarray(True)
     s, converged, _ = jax.lax.while_loop(lambda carry: carry[2], iterate, initial_carry)
@@ -178,7 +180,7 @@ def solve_newton(
         return is_at_limit(s, is_damped) | ~jnp.isfinite(jnp.sum(s.k))
 
     def is_unsolved(s: IterationState, residual, is_damped):
-        converged = s.has_converged_or_ended_small(
+        converged = s.has_newton_converged(
             is_at_limit(s, is_damped), scale(s.k), options, norm(residual), slope_rounding
         )
         return jnp.logical_not(is_solved) & ~converged
@@ -242,7 +244,7 @@ def solve_newton(
         is_unfinished, newton_cycle, (IterationState.initial(initial_k), initial_residual, jnp.asarray(False))
     )
     converged = ~is_unsolved(s, residual, is_damped) & jnp.isfinite(jnp.sum(s.k))
-    slope_rounding = jnp.where(s.is_at_plateau(scale(s.k), options), 0.0, slope_rounding)
+    slope_rounding = jnp.where(s.is_update_at_rounding_plateau(scale(s.k), options), 0.0, slope_rounding)
     return StageSolution(
         s.k, converged, jnp.isfinite(s.update), s.update, n_fixed_point, s.n_iterations, slope_rounding
     )
@@ -299,9 +301,9 @@ def explicit_stage_solution(
     x, zero_count = system.solved_subsystem(x)[1], jnp.zeros((), dtype=jnp.int64)
     norm = options.norm_for_dim(x.size)
     residual = norm(jnp.zeros_like(x).at[0].set(constraint_residual(k)))  # the residual is the length of a vector
-    converged = residual <= options.projection_rtol * norm(k[0]) + options.projection_state_rtol * update_scale(
-        x, h, k[0], options
-    )
+    converged = residual <= options.projection_rtol * norm(
+        k[0]
+    ) + options.projection_state_rtol * scale_of_slope_updates(x, h, k[0], options)
     return StageSolution(k, converged, jnp.isfinite(residual), residual, zero_count + 1, zero_count, jnp.zeros(()))
 
 
@@ -337,7 +339,7 @@ def _map_with_vmap(function: Callable, vectors) -> jax.Array:
     return jax.vmap(function)(vectors)
 
 
-def update_scale(x, h, k, options: SolverOptions = DEFAULT_OPTIONS):
+def scale_of_slope_updates(x, h, k, options: SolverOptions = DEFAULT_OPTIONS):
     """Return the scale ``|x|/|h| + |k|`` of updates of the slopes."""
     norm = options.norm_for_dim(x.size)
     return norm(x) / jnp.abs(h) + norm(k) + options.tiny

@@ -137,7 +137,7 @@ def reorder_components(
     )
 
 
-def start_step(system: System, x, energy_before) -> tuple[System, jax.Array]:
+def system_and_state_at_step_start(system: System, x, energy_before) -> tuple[System, jax.Array]:
     """Return the system and the state vector with which a step from x starts.
 
     They differ from those given only in a run with breaks, at which functions of time jump.
@@ -168,7 +168,7 @@ def take_step(
     An engine that has Newton's method elsewhere passes ``newton_fallback(fixed_point_result, x, compensation, h, k,
     previous_slopes)``, which replaces it.
     """
-    system, x = start_step(system, state.x, state.energy)
+    system, x = system_and_state_at_step_start(system, state.x, state.energy)
     state = state._replace(x=x)
     system, method, state, restore_order = reorder_components(system, method, state, options)
     if not method.carries_compensation:

@@ -204,7 +204,7 @@ class AdaptiveState(NamedTuple):
     max_relative_rate: jax.Array  # largest rate of change of the state so far, relative to its norm
     growth_rate: jax.Array  # largest growth rate when it was last computed; NaN if it must be computed
     jacobian_probe: jax.Array  # probe of the Jacobian when the growth rate was last computed
-    root_bracket: jax.Array  # search for the first event in a step: see root_bracket.search_array
+    root_bracket: jax.Array  # search for the first event in a step: see root_bracket.pack_bracket_and_end_values
 
 
 def jacobian_probe_shape(system: System, method: OneStepMethod, control: StepControl) -> tuple[int, ...]:
@@ -215,18 +215,20 @@ def jacobian_probe_shape(system: System, method: OneStepMethod, control: StepCon
     return jax.eval_shape(lambda x: jacobian_probe(*system.solved_subsystem(x)), x).shape
 
 
-def next_step_size_and_end(control: StepControl, adaptive_state: AdaptiveState) -> tuple[jax.Array, jax.Array]:
+def next_step_size_and_end_time(control: StepControl, adaptive_state: AdaptiveState) -> tuple[jax.Array, jax.Array]:
     """Return the size of the next step, a full step or a trial step of an event search, and the time after it."""
-    h, time_after = next_full_step_size_and_end(control, adaptive_state)
+    h, time_after = next_full_step_size_and_end_time(control, adaptive_state)
     if not control.event_functions:
         return h, time_after
-    bracket, _ = root_bracket.split_search(adaptive_state.root_bracket)
+    bracket, _ = root_bracket.unpack_bracket_and_end_values(adaptive_state.root_bracket)
     trial_step = bracket.trial_fraction * bracket.step_size
     trial_time = jnp.minimum(adaptive_state.t + trial_step, adaptive_state.stop_time)
     return jnp.where(bracket.step_size > 0.0, trial_step, h), jnp.where(bracket.step_size > 0.0, trial_time, time_after)
 
 
-def next_full_step_size_and_end(control: StepControl, adaptive_state: AdaptiveState) -> tuple[jax.Array, jax.Array]:
+def next_full_step_size_and_end_time(
+    control: StepControl, adaptive_state: AdaptiveState
+) -> tuple[jax.Array, jax.Array]:
     """Return the size of the next full step and the time at its end; no step ends just before a stop time."""
     if control.adaptive:
         remaining = adaptive_state.stop_time - adaptive_state.t

@@ -113,7 +113,7 @@ class AdaptiveRun:
         handler, self.n_event_steps = self.pause_handler, 0
         self.occurrences, self.sign_jumps = handler.occurrences, handler.sign_jumps
         self.undefined_ends, self.undefined_events = handler.undefined_ends, list[int]()
-        self.state: Any = _clear_pause_status(adaptive_runs.state())
+        self.state: Any = _clear_pause_status(adaptive_runs.state_of_only_trajectory())
         self.n_rejected = 0
         self.event_time: float | None = None
         self.underflow_step_size: float | None = None
@@ -148,7 +148,7 @@ class AdaptiveRun:
             self.pause_handler.adaptive_runs = self.runs
             return
         self.n_rejected = int(self._scalar("n_rejected"))
-        self.state = _clear_pause_status(self.runs.state())
+        self.state = _clear_pause_status(self.runs.state_of_only_trajectory())
         is_accepted = np.diff(attempts["step"], prepend=first_step) > 0
         if is_accepted.any():
             x, energy, entropy, step_counts, end_times, h = (attempts[name][is_accepted] for name in ATTEMPT_FIELDS)

@@ -17,7 +17,7 @@ import numpy as np
 from manifolds.errors import warn
 
 from ..engines.status_codes import StatusCode
-from ..engines.step import SavedStates, State, energy_and_entropy_at, start_step
+from ..engines.step import SavedStates, State, energy_and_entropy_at, system_and_state_at_step_start
 from ..errors import FileError
 from ..integrators import Reference
 from ..integrators.fluctuating import noise_dimension
@@ -173,7 +173,7 @@ class Run:
         except INTERRUPTING_ERRORS as error:
             self._set_interrupted_at_start(interruption_reason(error))
             return
-        state = adaptive_runs.state()
+        state = adaptive_runs.state_of_only_trajectory()
         self.saved_energies_entropies = [np.array([[float(state.energy), float(state.entropy)]])]
         values_per_step = self.system.dim * ((0 if saves_at_stops else 1) / save_every + (self.all_states is not None))
         max_steps = MAX_STORED_VALUES / max(values_per_step, 1e-9)
@@ -250,7 +250,7 @@ class Run:
         x, n_evaluations, energy = np.array(self.saved_states[0]), 0, self.saved_energies_entropies[0][0, 0]
         clock = self.system.clock
         for first, last in itertools.pairwise([0, *break_indices.tolist(), len(times) - 1]):
-            system, x[-1] = start_step(self.system, jnp.asarray(x[-1]), energy)
+            system, x[-1] = system_and_state_at_step_start(self.system, jnp.asarray(x[-1]), energy)
             states, n, message, was_interrupted = self.method.trajectory(system, x[-1], times[first : last + 1])
             x, n_evaluations = np.concatenate([x, states[1:]]), n_evaluations + n
             if message or was_interrupted or len(states) <= last - first:

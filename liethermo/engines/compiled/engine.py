@@ -63,11 +63,11 @@ class ShortRun:
     """
 
     def __init__(
-        self, addresses: dict[str, int], segments: Sequence[tuple[float, int]], increments: Sequence[np.ndarray]
+        self, addresses: dict[str, int], segments: Sequence[tuple[float, int]], noise_increments: Sequence[np.ndarray]
     ):
         sizes, counts = np.array([h for h, _ in segments]), np.array([n_steps for _, n_steps in segments])
-        pointers = np.array([array.ctypes.data for array in increments])
-        self._arrays = sizes, counts, increments, pointers
+        pointers = np.array([array.ctypes.data for array in noise_increments])
+        self._arrays = sizes, counts, noise_increments, pointers
         arrays = {"sizes": sizes, "counts": counts, "increments": pointers}
         self._fields = np.zeros(len(FIELD_TYPES), dtype=np.int64)
         known = addresses | {name: array.ctypes.data for name, array in arrays.items()} | {"n_segments": len(sizes)}
@@ -75,20 +75,23 @@ class ShortRun:
             self._fields[list(FIELD_TYPES).index(name)] = value
         self._newton = list(FIELD_TYPES).index("newton")
         self._functions: tuple[Any, ...] = ()
-        self._address, self._run = self._fields.ctypes.data, RUN_SIGNATURE(_run_code().function_address("run"))
+        self._address, self._run = (
+            self._fields.ctypes.data,
+            RUN_SIGNATURE(_compile_short_run_function().function_address("run")),
+        )
 
-    def __call__(self, functions: tuple[Any, Any], newton_address: int) -> bool:
+    def __call__(self, loop_functions: tuple[Any, Any], newton_address: int) -> bool:
         """Take all steps by ``begin`` and ``advance``; return False if one fails or needs Newton's method."""
-        if functions != self._functions:
-            self._functions = functions
-            self._fields[:2] = [ctypes.cast(function, ctypes.c_void_p).value or 0 for function in functions]
+        if loop_functions != self._functions:
+            self._functions = loop_functions
+            self._fields[:2] = [ctypes.cast(function, ctypes.c_void_p).value or 0 for function in loop_functions]
         if newton_address:
             self._fields[self._newton] = newton_address
         return not self._run(self._address)
 
 
 @functools.cache
-def _run_code() -> MachineCode:
+def _compile_short_run_function() -> MachineCode:
     """Compile ``run(description)``, which returns 1 if a step fails or needs Newton's method, and otherwise 0."""
     module = ir.Module("run")
     description = ir.LiteralStructType(FIELD_TYPES.values()).as_pointer()
@@ -168,9 +171,9 @@ class CompiledEngine:
             self._step_loop.start_blocks(self._parameters, np.asarray(x, dtype=np.float64)[None], self._planned_steps)
         )
 
-    def advance(self, state: State, h, saves: int, save_every: int, noise=None):
-        new_state, out = self._run(state, h, saves, save_every, noise)
-        is_reached = np.arange(saves) < (int(new_state.step) - int(state.step)) // save_every
+    def advance(self, state: State, h, n_saves: int, save_every: int, noise=None):
+        new_state, out = self._run(state, h, n_saves, save_every, noise)
+        is_reached = np.arange(n_saves) < (int(new_state.step) - int(state.step)) // save_every
         return new_state, (out[:, :-2], out[:, -2], out[:, -1], is_reached)
 
     def step(self, state: State, h, noise=None) -> State:
@@ -182,10 +185,10 @@ class CompiledEngine:
         fields = self._step_loop.read_fields(blocks, ("x", "status"))
         return np.where(fields["status"].reshape(-1, 1) == 0.0, fields["x"], np.nan)
 
-    def _run(self, state: State, h, saves: int, save_every: int, noise) -> tuple[State, np.ndarray]:
+    def _run(self, state: State, h, n_saves: int, save_every: int, noise) -> tuple[State, np.ndarray]:
         blocks = self._step_loop.block_from_state(state)
         out = self._step_loop.advance_blocks(
-            self._parameters, blocks, h, saves, save_every, None if noise is None else noise[None]
+            self._parameters, blocks, h, n_saves, save_every, None if noise is None else noise[None]
         )[0]
         return self._state_from_block(blocks), out
 
@@ -213,7 +216,7 @@ class CompiledTrajectory:
 
     def __init__(self, step_loop: CompiledStepLoop, parameters: np.ndarray):
         self._loop, self.parameters = step_loop, np.array(parameters, dtype=np.float64)
-        self._block = step_loop.make_blocks({"x": np.zeros((1, *step_loop.field_shape("x")))})
+        self._block = step_loop.blocks_from_fields({"x": np.zeros((1, *step_loop.field_shape("x")))})
         self._row = rows = step_loop.block_rows(self._block)[0, :, 0]
         self._x, self._status, self._step, self._h = (
             rows[step_loop.row_slice(name)] for name in ("x", "status", "step", "h")
@@ -258,7 +261,7 @@ class CompiledTrajectory:
         """
         saved, segments = np.empty(self._n_saved_values), tuple(segments)
         n_total, loop = sum(n_steps for _, n_steps in segments), self._loop
-        increments = [loop.noise_by_lane_block(None, 1, n_steps) for _, n_steps in segments]
+        increments = [loop.noise_increments_by_lane_block(None, 1, n_steps) for _, n_steps in segments]
         addresses = dict(zip(("parameters", "block", "n_done"), self._addresses, strict=True))
         fields = {"status": self._status, "h": self._h, "saved": saved}
         addresses |= {name: field.ctypes.data for name, field in fields.items()}
@@ -282,11 +285,15 @@ class CompiledTrajectory:
 
     def _take_steps(self, h: float, n_saves: int, steps_per_save: int, noise: np.ndarray | None, out) -> None:
         n_steps = n_saves * steps_per_save
-        increments = self._loop.noise_by_lane_block(None if noise is None else noise[None], 1, n_steps)
+        increments = self._loop.noise_increments_by_lane_block(None if noise is None else noise[None], 1, n_steps)
         parameters, block, n_done = self._addresses
         self._h[0], self._n_done[0] = h, 0
         _, advance = self._loop.loop_functions(n_steps)
-        newton, out_address, noise_address = self._loop.newton_address(False), out.ctypes.data, increments.ctypes.data
+        newton, out_address, noise_address = (
+            self._loop.newton_address(False),
+            out.ctypes.data,
+            increments.ctypes.data,
+        )
         while (
             advance(parameters, block, n_done, 1, n_saves, steps_per_save, out_address, n_steps, noise_address, newton)
             < 1
@@ -349,7 +356,7 @@ class CompiledAdaptiveRuns:
     def advance(self, max_attempts: int) -> None:
         self.step_loop.advance_blocks(self.first_parameters, self.blocks, 0.0, 1, max_attempts)
 
-    def state(self) -> State:
+    def state_of_only_trajectory(self) -> State:
         return self.step_loop.state_from_block(self.blocks.copy())
 
     def record_attempts(self, max_attempts: int) -> dict[str, np.ndarray]:
@@ -360,7 +367,7 @@ class CompiledAdaptiveRuns:
         except UnsupportedPrimitive:
             if self.read("n_attempts")[0] == n_before:
                 raise
-        return self.step_loop.saved_fields_of_one(out[0, : int(self.read("n_attempts")[0] - n_before)])
+        return self.step_loop.saved_fields_of_single_trajectory(out[0, : int(self.read("n_attempts")[0] - n_before)])
 
     def read(self, name: str, indices: np.ndarray | slice = slice(None)) -> np.ndarray:
         if isinstance(indices, slice):

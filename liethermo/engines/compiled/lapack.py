@@ -43,7 +43,7 @@ SPECIAL_FUNCTIONS = {
 
 
 @functools.cache
-def bind_symbols() -> None:
+def bind_scipy_functions_in_llvm() -> None:
     """Bind the names of SciPy's exported functions in LLVM."""
     import scipy.linalg.cython_lapack
     import scipy.special.cython_special
@@ -72,7 +72,7 @@ def find_or_write_kernel(writer: Any, call: LapackCall) -> ir.Function:
     if name in writer.builder.module.globals:
         return writer.builder.module.globals[name]
     function, function_writer = writer.new_function(name, [FLOAT64_POINTER, FLOAT64_POINTER])
-    _KernelWriter(function_writer, function.args, call).write()
+    _KernelWriter(function_writer, function.args, call).write_kernel()
     return function
 
 
@@ -84,37 +84,37 @@ class _KernelWriter:
         self.parts_per_entry = 2 if call.is_complex else 1
         self.input_pointer, self.output_pointer = arguments
 
-    def write(self) -> None:
+    def write_kernel(self) -> None:
         build, shapes = self.builder, self.call.argument_shapes
         total = sum(map(math.prod, shapes)) * self.parts_per_entry
         all_finite = build.alloca(ir.IntType(1))
         build.store(ir.Constant(ir.IntType(1), 1), all_finite)
-        for i in self._loop(total):
+        for i in self._write_loop(total):
             value = build.load(self._lane_entry_pointer(self.input_pointer, i))
             difference = build.fsub(value, value)  # NaN for infinity
             is_finite = build.fcmp_ordered("==", difference, ir.Constant(FLOAT64, 0.0))
             build.store(build.and_(build.load(all_finite), is_finite), all_finite)
         with build.if_else(build.load(all_finite)) as (finite_branch, other_branch):
             with finite_branch:
-                getattr(self, f"_{self.call.name}")(*self.call.sizes)
+                getattr(self, f"_write_{self.call.name}")(*self.call.sizes)
             with other_branch:
                 self._write_nan()
         build.ret_void()
 
     # -- the calls ----------------------------------------------------------------------------------------------------
 
-    def _eigh(self, n: int) -> None:
+    def _write_eigh(self, n: int) -> None:
         a, w = self._copy_input(0, n, n), self._allocate_doubles(n)
         is_complex, work_size = self.call.is_complex, 34 * n  # workspace of a blocked reduction to tridiagonal form
         arguments = [
-            self._pointer_to_char("V"),
-            self._pointer_to_char("L"),
-            self._pointer_to_integer(n),
+            self._new_char_slot("V"),
+            self._new_char_slot("L"),
+            self._new_integer_slot(n),
             a,
-            self._pointer_to_integer(n),
+            self._new_integer_slot(n),
             w,
         ]
-        arguments += [self._allocate_doubles(work_size * self.parts_per_entry), self._pointer_to_integer(work_size)]
+        arguments += [self._allocate_doubles(work_size * self.parts_per_entry), self._new_integer_slot(work_size)]
         arguments += [self._allocate_doubles(3 * n)] if is_complex else []
 
         def write_results() -> None:
@@ -123,30 +123,30 @@ class _KernelWriter:
 
         self._call_and_write_results_or_nan("zheev" if is_complex else "dsyev", arguments, write_results)
 
-    def _lu(self, m: int, n: int) -> None:
+    def _write_lu(self, m: int, n: int) -> None:
         a, n_pivots = self._copy_input(0, m, n), min(m, n)
         pivots = self._allocate_integers(n_pivots)
         routine = "zgetrf" if self.call.is_complex else "dgetrf"
         self._call_routine(
             routine,
             [
-                self._pointer_to_integer(m),
-                self._pointer_to_integer(n),
+                self._new_integer_slot(m),
+                self._new_integer_slot(n),
                 a,
-                self._pointer_to_integer(m),
+                self._new_integer_slot(m),
                 pivots,
                 self._allocate_integers(1),
             ],
         )
         self._copy_output(0, a, m, n)
-        for i in self._loop(n_pivots):  # LAPACK counts from 1
+        for i in self._write_loop(n_pivots):  # LAPACK counts from 1
             pivot_index = self.builder.sub(self.builder.load(self.builder.gep(pivots, [i])), ir.Constant(INT32, 1))
             self.builder.store(self.builder.sitofp(pivot_index, FLOAT64), self._output_entry_pointer(1, i))
 
-    def _inverse(self, n: int) -> None:
+    def _write_inverse(self, n: int) -> None:
         is_complex = self.call.is_complex
         a = self._copy_input(0, n, n)
-        rows = self._pointer_to_integer(n)
+        rows = self._new_integer_slot(n)
         pivots = self._allocate_integers(n)
         work_size = 64 * n
         factorise_arguments = [rows, rows, a, rows, pivots]
@@ -158,7 +158,7 @@ class _KernelWriter:
                 rows,
                 pivots,
                 self._allocate_doubles(work_size * self.parts_per_entry),
-                self._pointer_to_integer(work_size),
+                self._new_integer_slot(work_size),
             ]
             self._call_and_write_results_or_nan(
                 "zgetri" if is_complex else "dgetri", invert_arguments, lambda: self._copy_output(0, a, n, n)
@@ -166,29 +166,29 @@ class _KernelWriter:
 
         self._call_and_write_results_or_nan("zgetrf" if is_complex else "dgetrf", factorise_arguments, invert)
 
-    def _qr(self, m: int, n: int, columns: int) -> None:
+    def _write_qr(self, m: int, n: int, columns: int) -> None:
         n_reflectors, width, is_complex = min(m, n), max(n, columns), self.call.is_complex
         a = self._copy_input(0, m, n, width)
         tau = self._allocate_doubles(n_reflectors * self.parts_per_entry)
         work_size = 64 * width
         work = self._allocate_doubles(work_size * self.parts_per_entry)
-        rows = self._pointer_to_integer(m)
+        rows = self._new_integer_slot(m)
         info = self._allocate_integers(1)
         factorise_arguments = [
             rows,
-            self._pointer_to_integer(n),
+            self._new_integer_slot(n),
             a,
             rows,
             tau,
             work,
-            self._pointer_to_integer(work_size),
+            self._new_integer_slot(work_size),
             info,
         ]
         self._call_routine("zgeqrf" if is_complex else "dgeqrf", factorise_arguments)
         r = self._allocate_doubles(columns * n * self.parts_per_entry)
         build = self.builder
-        for j in self._loop(n):
-            for i in self._loop(columns):
+        for j in self._write_loop(n):
+            for i in self._write_loop(columns):
                 source = self._matrix_entry_pointer(a, i, j, m)
                 for part in range(self.parts_per_entry):
                     value = build.load(build.gep(source, [ir.Constant(INT64, part)]))
@@ -197,20 +197,20 @@ class _KernelWriter:
                     build.store(build.select(is_upper, value, ir.Constant(FLOAT64, 0.0)), target)
         form_q_arguments = [
             rows,
-            self._pointer_to_integer(columns),
-            self._pointer_to_integer(n_reflectors),
+            self._new_integer_slot(columns),
+            self._new_integer_slot(n_reflectors),
             a,
             rows,
             tau,
             work,
-            self._pointer_to_integer(work_size),
+            self._new_integer_slot(work_size),
             info,
         ]
         self._call_routine("zungqr" if is_complex else "dorgqr", form_q_arguments)
         self._copy_output(0, a, m, columns)
         self._copy_output(1, r, columns, n)
 
-    def _svd(self, m: int, n: int, full: int) -> None:
+    def _write_svd(self, m: int, n: int, full: int) -> None:
         n_singular, max_dim, is_complex = min(m, n), max(m, n), self.call.is_complex
         n_left, n_right = (m, n) if full else (n_singular, n_singular)
         a, s = self._copy_input(0, m, n), self._allocate_doubles(n_singular)
@@ -218,15 +218,15 @@ class _KernelWriter:
         v = self._allocate_doubles(n_right * n * self.parts_per_entry)
         work_size = 8 * max_dim * max_dim + 64 * max_dim
         arguments = [
-            self._pointer_to_char("A" if full else "S"),
-            self._pointer_to_integer(m),
-            self._pointer_to_integer(n),
+            self._new_char_slot("A" if full else "S"),
+            self._new_integer_slot(m),
+            self._new_integer_slot(n),
             a,
-            self._pointer_to_integer(m),
+            self._new_integer_slot(m),
             s,
         ]
-        arguments += [u, self._pointer_to_integer(m), v, self._pointer_to_integer(n_right)]
-        arguments += [self._allocate_doubles(work_size * self.parts_per_entry), self._pointer_to_integer(work_size)]
+        arguments += [u, self._new_integer_slot(m), v, self._new_integer_slot(n_right)]
+        arguments += [self._allocate_doubles(work_size * self.parts_per_entry), self._new_integer_slot(work_size)]
         if is_complex:
             arguments.append(self._allocate_doubles(8 * max_dim * max_dim + 8 * max_dim))
         arguments.append(self._allocate_integers(8 * n_singular))
@@ -256,8 +256,8 @@ class _KernelWriter:
     def _copy_input(self, start: int, m: int, n: int, width: int | None = None) -> ir.Value:
         """Copy an argument into LAPACK's storage, with room for ``width`` columns."""
         build, a = self.builder, self._allocate_doubles(m * (width or n) * self.parts_per_entry)
-        for i in self._loop(m):
-            for j in self._loop(n):
+        for i in self._write_loop(m):
+            for j in self._write_loop(n):
                 offset = build.add(build.mul(i, ir.Constant(INT64, n)), j)
                 for part in range(self.parts_per_entry):
                     source = self._lane_entry_pointer(
@@ -269,8 +269,8 @@ class _KernelWriter:
 
     def _copy_output(self, result_index: int, a: ir.Value, m: int, n: int) -> None:
         build = self.builder
-        for i in self._loop(m):
-            for j in self._loop(n):
+        for i in self._write_loop(m):
+            for j in self._write_loop(n):
                 offset = build.add(build.mul(i, ir.Constant(INT64, n)), j)
                 for part in range(self.parts_per_entry):
                     value = build.load(build.gep(self._matrix_entry_pointer(a, i, j, m), [ir.Constant(INT64, part)]))
@@ -280,11 +280,11 @@ class _KernelWriter:
                     )
 
     def _copy_output_vector(self, result_index: int, w: ir.Value, n: int) -> None:
-        for i in self._loop(n):
+        for i in self._write_loop(n):
             self.builder.store(self.builder.load(self.builder.gep(w, [i])), self._output_entry_pointer(result_index, i))
 
     def _write_nan(self) -> None:
-        for i in self._loop(len(self.call.kinds)):
+        for i in self._write_loop(len(self.call.kinds)):
             self.builder.store(ir.Constant(FLOAT64, math.nan), self._lane_entry_pointer(self.output_pointer, i))
 
     # -- what LAPACK is told ------------------------------------------------------------------------------------------
@@ -299,19 +299,19 @@ class _KernelWriter:
     def _allocate_integers(self, count: int) -> ir.Value:
         return self._allocate(INT32, count)
 
-    def _pointer_to_integer(self, value: int) -> ir.Value:
+    def _new_integer_slot(self, value: int) -> ir.Value:
         pointer = self._allocate_integers(1)
         self.builder.store(ir.Constant(INT32, value), pointer)
         return pointer
 
-    def _pointer_to_char(self, letter: str) -> ir.Value:
+    def _new_char_slot(self, letter: str) -> ir.Value:
         pointer = self._allocate(INT8, 1)
         self.builder.store(ir.Constant(INT8, ord(letter)), pointer)
         return pointer
 
     def _call_routine(self, name: str, arguments: Sequence[ir.Value]) -> None:
         self.builder.call(
-            declare_symbol(self.builder.module, name, ir.VoidType(), [a.type for a in arguments]), arguments
+            declare_external_function(self.builder.module, name, ir.VoidType(), [a.type for a in arguments]), arguments
         )
 
     def _call_and_write_results_or_nan(self, name: str, arguments: Sequence[ir.Value], write_results) -> None:
@@ -325,13 +325,13 @@ class _KernelWriter:
             with failure_branch:
                 self._write_nan()
 
-    def _loop(self, count: int):
+    def _write_loop(self, count: int):
         """Write a loop: the body of the Python ``for`` is written once, with the loop counter."""
         with self.writer.loop_range(ir.Constant(INT64, count)) as i:
             yield i
 
 
-def declare_symbol(
+def declare_external_function(
     module: ir.Module, name: str, return_type: ir.Type, argument_types: Sequence[ir.Type]
 ) -> ir.Function:
     """Declare a function that is bound when the code is loaded."""

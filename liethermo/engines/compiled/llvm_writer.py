@@ -15,7 +15,7 @@ from ...tracing.branches import Branch, instructions_in_branches
 from ...tracing.builder import Block, Instruction, Scalar
 from ...tracing.program import Program
 from ...tracing.scalarize import UnsupportedPrimitive
-from .lapack import SPECIAL_FUNCTIONS, declare_symbol
+from .lapack import SPECIAL_FUNCTIONS, declare_external_function
 from .loops_and_calls import BlockResults, Table, make_table, select_entry, write_block
 
 FLOAT64 = ir.DoubleType()
@@ -74,7 +74,7 @@ class ProgramWriter:
         function.attributes.add("noinline")
         return function, ProgramWriter(ir.IRBuilder(function.append_basic_block("entry")), self.lanes)
 
-    def write_as_doubles(
+    def write_program_with_double_outputs(
         self, program: Program, read_input: InputReader, find_table: TableFinder | None = None
     ) -> list[list[ir.Value]]:
         """Write a program and return its outputs as doubles, array by array.
@@ -97,8 +97,8 @@ class ProgramWriter:
     ) -> list[list[ir.Value]]:
         """Write a program and return its outputs, array by array, with integers and truth values unconverted."""
         emitter = _ProgramEmitter(self, program, read_input, find_table)
-        emitter.write_items(instructions_in_branches(program))
-        return [[emitter.value(a) for a in entries] for entries in program.outputs]
+        emitter.write_instructions_and_branches(instructions_in_branches(program))
+        return [[emitter.value_of_operand(a) for a in entries] for entries in program.outputs]
 
     def cast(self, value: ir.Value, kind: str) -> ir.Value:
         """Convert a value to a kind, "f", "b" or "i"."""
@@ -194,7 +194,7 @@ class ProgramWriter:
         """Call a special function of SciPy for each lane; the last argument is a flag that Cython adds."""
         dispatch_flag = ir.Constant(ir.IntType(32), 0)
         argument_types = [FLOAT64] * SPECIAL_FUNCTIONS[op][1] + [dispatch_flag.type]
-        function = declare_symbol(self.builder.module, op, FLOAT64, argument_types)
+        function = declare_external_function(self.builder.module, op, FLOAT64, argument_types)
         return self._apply_per_lane(lambda lane_args: self.builder.call(function, [*lane_args, dispatch_flag]), args)
 
     def fused_multiply_add(
@@ -327,18 +327,18 @@ class _ProgramEmitter:
         self.block_results: dict[Scalar, BlockResults] = {}
         self.tables: dict[Scalar, Table] = {}
 
-    def value(self, a: Scalar) -> ir.Value:
-        if not isinstance(a, str):
-            return self.writer.constant(a)
-        if a not in self.values:
-            self.values[a] = self.read_input(*self.input_positions[a])
-        return self.values[a]
+    def value_of_operand(self, operand: Scalar) -> ir.Value:
+        if not isinstance(operand, str):
+            return self.writer.constant(operand)
+        if operand not in self.values:
+            self.values[operand] = self.read_input(*self.input_positions[operand])
+        return self.values[operand]
 
-    def operand(self, a: Scalar) -> Any:
+    def value_or_table_of_operand(self, operand: Scalar) -> Any:
         """Return a value or a table."""
-        return self.tables.get(a) or self.value(a)
+        return self.tables.get(operand) or self.value_of_operand(operand)
 
-    def write_items(self, items: Sequence[Instruction | Branch]) -> None:
+    def write_instructions_and_branches(self, items: Sequence[Instruction | Branch]) -> None:
         for item in items:
             if isinstance(item, Branch):
                 self.write_branch(item)
@@ -348,7 +348,7 @@ class _ProgramEmitter:
     def write_instruction(self, instruction: Instruction) -> None:
         writer, (target, op, args) = self.writer, instruction
         if isinstance(op, Block):
-            self.block_results[target] = write_block(writer, op, [self.operand(a) for a in args])
+            self.block_results[target] = write_block(writer, op, [self.value_or_table_of_operand(a) for a in args])
             return
         if op == "item":
             self.values[target] = self.block_results[args[0]].item(int(args[1]))
@@ -356,19 +356,19 @@ class _ProgramEmitter:
         if op in ("table", "column"):
             is_new_table = op == "table"
             new_table = (
-                self.table_of_inputs(args) or make_table(writer, [self.value(a) for a in args])
+                self.table_of_inputs(args) or make_table(writer, [self.value_of_operand(a) for a in args])
                 if is_new_table
                 else None
             )
             self.tables[target] = new_table or self.block_results[args[0]].table_at(int(args[1]))
             return
         if op == "lookup":
-            self.values[target] = self.operand(args[1]).gather(self.value(args[0]))
+            self.values[target] = self.value_or_table_of_operand(args[1]).gather(self.value_of_operand(args[0]))
             return
         if op == "wrap":
-            self.values[target] = writer.wrap_integer(self.value(args[0]), int(args[1]), bool(args[2]))
+            self.values[target] = writer.wrap_integer(self.value_of_operand(args[0]), int(args[1]), bool(args[2]))
             return
-        operands = writer.match_constant_types(op, [self.value(a) for a in args], args)
+        operands = writer.match_constant_types(op, [self.value_of_operand(a) for a in args], args)
         is_unsigned_max = op == "max" and self.nonnegative.issuperset(args)
         product_indices = [i for i, a in enumerate(args) if a in self.fusible_products] if op in ("add", "sub") else []
         if product_indices:
@@ -414,7 +414,7 @@ class _ProgramEmitter:
             self.values = side_values
             writer.active_lanes = is_taken if outer_lanes is None else build.and_(outer_lanes, is_taken)
             with build.if_then(writer.has_true_lane(writer.active_lanes)):
-                self.write_items(side)
+                self.write_instructions_and_branches(side)
                 side_block = build.block
             self.values, writer.active_lanes = outer_values, outer_lanes
             for a in dict.fromkeys(choice.args[choice_index] for choice in branch.choices):
@@ -423,7 +423,7 @@ class _ProgramEmitter:
                     outer_values[a].add_incoming(side_values[a], side_block)
                     unused = ir.Constant(side_values[a].type, None)  # no lane chooses it
                     outer_values[a].add_incoming(unused, block_before)
-        self.write_items(branch.choices)
+        self.write_instructions_and_branches(branch.choices)
 
 
 MAX_NORMAL_ARGUMENT = 700.0

@@ -110,14 +110,18 @@ class CompiledLoops:
                 self._can_skip_optimisation and self._steps_so_far + planned_steps <= MAX_UNOPTIMISED_STEPS
             )
             if not self._loaded:
-                self._load(self._compile(skip_optimisation))
+                self._append_loop_functions(self._compile(skip_optimisation))
             elif not skip_optimisation and self._loaded[-1][0].skip_optimisation:
-                self._load(MachineCode(self._loaded[-1][0].ir_text))
+                self._append_loop_functions(MachineCode(self._loaded[-1][0].ir_text))
             return self._loaded[-1][1:]
 
-    def _load(self, code: MachineCode) -> None:
+    def _append_loop_functions(self, machine_code: MachineCode) -> None:
         self._loaded.append(
-            (code, BEGIN_SIGNATURE(code.function_address("begin")), ADVANCE_SIGNATURE(code.function_address("advance")))
+            (
+                machine_code,
+                BEGIN_SIGNATURE(machine_code.function_address("begin")),
+                ADVANCE_SIGNATURE(machine_code.function_address("advance")),
+            )
         )
 
 
@@ -187,7 +191,7 @@ class _StepLoopWriter(ProgramWriter):
             total_steps = build.mul(argument["saves"], argument["every"])
             limit = build.add(build.load(steps_done), argument["most"])
             end_step = build.select(build.icmp_signed("<", total_steps, limit), total_steps, limit)
-            self.load_rows(self.state_names)
+            self.load_fields_from_block(self.state_names)
 
             def is_running() -> ir.Value:
                 return build.fcmp_ordered("==", build.load(self.slots["status"][0]), self.constant(0.0))
@@ -205,24 +209,24 @@ class _StepLoopWriter(ProgramWriter):
                 with build.if_then(
                     build.icmp_signed("==", build.srem(build.load(steps_done), argument["every"]), self.int64(0))
                 ):
-                    self.store_output(i, build.sdiv(build.load(steps_done), argument["every"]))
-            self.store_rows(self.state_names)
+                    self.store_saved_fields(i, build.sdiv(build.load(steps_done), argument["every"]))
+            self.store_fields_in_block(self.state_names)
         build.ret(argument["count"])
 
     def write_start_function(self) -> None:
         """Write ``begin(p, blocks, count)``, which computes the initial engine state of each block from its x."""
         with self.loop_range(self.arguments["count"]) as i:
             self.select_block(i)
-            self.load_rows([name for name in self.programs["begin"].arguments if name != "p"])
+            self.load_fields_from_block([name for name in self.programs["begin"].arguments if name != "p"])
             self.write_program_and_store_results("begin")
-            self.store_rows([name for name in self.state_names if name in self.programs["begin"].results])
+            self.store_fields_in_block([name for name in self.state_names if name in self.programs["begin"].results])
         self.builder.ret_void()
 
-    def select_block(self, i: ir.Value) -> None:
+    def select_block(self, block_number: ir.Value) -> None:
         """Make block i the one that the following instructions work on."""
-        offset = self.builder.mul(i, self.int64(self.layout.n_rows * self.lanes))
+        offset = self.builder.mul(block_number, self.int64(self.layout.n_rows * self.lanes))
         self.builder.store(self.builder.gep(self.arguments["blocks"], [offset]), self.block)
-        self.builder.store(i, self.block_index)
+        self.builder.store(block_number, self.block_index)
 
     def copy_noise_increments_to_slots(self, step_number: ir.Value) -> None:
         """Load the increments of a step from row ``step_number`` of ``noise``."""
@@ -246,7 +250,7 @@ class _StepLoopWriter(ProgramWriter):
             build.store(value, slot)
         with build.if_then(self.has_true_lane(needs_newton), likely=False):
             with build.if_then(build.icmp_unsigned("==", argument["newton"], ir.Constant(BYTE_POINTER, None))):
-                self.store_rows(self.state_names)
+                self.store_fields_in_block(self.state_names)
                 build.ret(build.load(self.block_index))
             solve_type = ir.FunctionType(ir.VoidType(), [FLOAT64_POINTER, FLOAT64_POINTER, INT64])
             function = build.bitcast(argument["newton"], solve_type.as_pointer())
@@ -286,7 +290,9 @@ class _StepLoopWriter(ProgramWriter):
             return Table(self, value_type, start=start, length=len(entries), stride=entries.step)
 
         for array, values in zip(
-            named_program.results, self.write_as_doubles(named_program.program, read, find_table), strict=True
+            named_program.results,
+            self.write_program_with_double_outputs(named_program.program, read, find_table),
+            strict=True,
         ):
             for slot, value in zip(self.slots[array], values, strict=True):
                 build.store(
@@ -305,21 +311,21 @@ class _StepLoopWriter(ProgramWriter):
         start = self.builder.gep(self.builder.load(self.block), [self.int64(row * self.lanes)])
         return self.builder.bitcast(start, self.double_type.as_pointer())
 
-    def load_rows(self, names: Sequence[str]) -> None:
+    def load_fields_from_block(self, names: Sequence[str]) -> None:
         for name in names:
             for i, slot in enumerate(self.slots[name]):
                 self.builder.store(self.builder.load(self.row_pointer(self.layout.first_rows[name] + i), align=8), slot)
 
-    def store_rows(self, names: Sequence[str]) -> None:
+    def store_fields_in_block(self, names: Sequence[str]) -> None:
         for name in names:
             for i, slot in enumerate(self.slots[name]):
                 self.builder.store(self.builder.load(slot), self.row_pointer(self.layout.first_rows[name] + i), align=8)
 
-    def store_output(self, i: ir.Value, save_number: ir.Value) -> None:
+    def store_saved_fields(self, block_number: ir.Value, save_number: ir.Value) -> None:
         """Write the saved fields of block i to ``out``, as save ``save_number``."""
         build, argument = self.builder, self.arguments
         saved_slots = [slot for name in self.saved_names for slot in self.slots[name]]
-        row = build.add(build.mul(i, argument["saves"]), build.sub(save_number, self.int64(1)))
+        row = build.add(build.mul(block_number, argument["saves"]), build.sub(save_number, self.int64(1)))
         start = build.gep(argument["out"], [build.mul(row, self.int64(len(saved_slots) * self.lanes))])
         for j, slot in enumerate(saved_slots):
             pointer = build.bitcast(build.gep(start, [self.int64(j * self.lanes)]), self.double_type.as_pointer())
@@ -373,7 +379,7 @@ def compile_newton_solver(
         return Table(writer, FLOAT64, start=start, length=len(entries), stride=entries.step)
 
     for i, value in enumerate(
-        itertools.chain.from_iterable(writer.write_as_doubles(program, read_argument, find_table))
+        itertools.chain.from_iterable(writer.write_program_with_double_outputs(program, read_argument, find_table))
     ):
         build.store(value, row_pointer(first_row + i))
     build.ret_void()

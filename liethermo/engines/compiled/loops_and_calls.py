@@ -35,7 +35,7 @@ def write_block(writer: Any, block: Block, args: Sequence[Any]) -> BlockResults:
     if isinstance(block, Routine):
         return _call_routine(writer, block, args)
     if isinstance(block, MatrixProduct):
-        return _write_product(writer, block, args)
+        return _write_matrix_product(writer, block, args)
     assert isinstance(block, LapackCall)
     return _call_kernel(writer, block, args)
 
@@ -58,7 +58,7 @@ def select_entry(writer: Any, index: ir.Value, entries: Sequence[ir.Value]) -> i
     return entries[0]
 
 
-def _allocate_slots(writer: Any, kinds: Sequence[str], values: Sequence[ir.Value]) -> list[ir.Value]:
+def _store_in_new_slots(writer: Any, kinds: Sequence[str], values: Sequence[ir.Value]) -> list[ir.Value]:
     """Allocate a stack slot for each value and store the value there."""
     build, slots = writer.builder, []
     for kind, value in zip(kinds, values, strict=True):
@@ -69,7 +69,7 @@ def _allocate_slots(writer: Any, kinds: Sequence[str], values: Sequence[ir.Value
     return slots
 
 
-def _argument_reader(*arrays: Sequence[ir.Value]) -> Callable[[int, int], ir.Value]:
+def _make_argument_reader(*arrays: Sequence[ir.Value]) -> Callable[[int, int], ir.Value]:
     return lambda i, j: arrays[i][j]
 
 
@@ -80,22 +80,22 @@ def _write_while(writer: Any, loop: WhileLoop, args: Sequence[ir.Value]) -> Bloc
     discarded. They do wait if an inner loop might not end for them.
     """
     build, n_constants = writer.builder, len(loop.test.inputs[0])
-    constants, slots = args[:n_constants], _allocate_slots(writer, loop.kinds, args[n_constants:])
+    constants, slots = args[:n_constants], _store_in_new_slots(writer, loop.kinds, args[n_constants:])
     has_separate_slots = writer.lanes > 1 and not any(isinstance(i.op, Block) for i in loop.body.instructions)
-    result_slots = _allocate_slots(writer, loop.kinds, args[n_constants:]) if has_separate_slots else slots
+    result_slots = _store_in_new_slots(writer, loop.kinds, args[n_constants:]) if has_separate_slots else slots
     outer_lanes = writer.active_lanes
-    (running_lanes,) = _allocate_slots(writer, "b", [writer.constant(True) if outer_lanes is None else outer_lanes])
+    (running_lanes,) = _store_in_new_slots(writer, "b", [writer.constant(True) if outer_lanes is None else outer_lanes])
 
     def has_running_lane() -> ir.Value:
         carried = [build.load(slot) for slot in slots]
-        ((test,),) = writer.write_program(loop.test, _argument_reader(constants, carried))
+        ((test,),) = writer.write_program(loop.test, _make_argument_reader(constants, carried))
         build.store(build.and_(build.load(running_lanes), writer.cast(test, "b")), running_lanes)
         return writer.has_true_lane(build.load(running_lanes))
 
     with writer.loop_while(has_running_lane):
         previous_values = [build.load(slot) for slot in slots]
         writer.active_lanes = build.load(running_lanes)
-        (new_values,) = writer.write_program(loop.body, _argument_reader(constants, previous_values))
+        (new_values,) = writer.write_program(loop.body, _make_argument_reader(constants, previous_values))
         for slot, result_slot, kind, new_value in zip(slots, result_slots, loop.kinds, new_values, strict=True):
             value = writer.cast(new_value, kind)
             if writer.lanes > 1:
@@ -110,13 +110,13 @@ def _write_scan(writer: Any, loop: ScanLoop, args: Sequence[Any]) -> BlockResult
     build, n_constants = writer.builder, len(loop.body.inputs[0])
     start = n_constants + len(loop.carry_kinds)
     constants = args[:n_constants]
-    slots = _allocate_slots(writer, loop.carry_kinds, args[n_constants:start])
+    slots = _store_in_new_slots(writer, loop.carry_kinds, args[n_constants:start])
     tables = args[start:]
     stacked_tables = [Table(writer, writer.type_of_kind[kind], length=loop.length) for kind in loop.stacked_kinds]
     with writer.loop_range(writer.int64(loop.length)) as count:
         i = build.sub(writer.int64(loop.length - 1), count) if loop.reverse else count
         carried, row = [build.load(slot) for slot in slots], [table.read(i) for table in tables]
-        new_carry, stacked_values = writer.write_program(loop.body, _argument_reader(constants, carried, row))
+        new_carry, stacked_values = writer.write_program(loop.body, _make_argument_reader(constants, carried, row))
         for slot, kind, value in zip(slots, loop.carry_kinds, new_carry, strict=True):
             build.store(writer.cast(value, kind), slot)
         for table, kind, value in zip(stacked_tables, loop.stacked_kinds, stacked_values, strict=True):
@@ -259,7 +259,7 @@ def _write_routine_function(writer: Any, routine: Routine, name: str, tables: Ma
             else build.load(build.gep(inputs, [function_writer.int64(number_positions[j])]))
         )
 
-    for i, value in enumerate(function_writer.write_as_doubles(routine.program, read)[0]):
+    for i, value in enumerate(function_writer.write_program_with_double_outputs(routine.program, read)[0]):
         build.store(value, build.gep(results, [function_writer.int64(i)]))
     build.ret_void()
     return function
@@ -269,18 +269,20 @@ PRODUCT_TILE_WIDTH = 8
 """Number of sums of a matrix product that are accumulated at once, so that none waits for the term of another."""
 
 
-def _write_product(writer: Any, block: MatrixProduct, args: Sequence[Table]) -> BlockResults:
+def _write_matrix_product(writer: Any, block: MatrixProduct, args: Sequence[Table]) -> BlockResults:
     """Write a matrix product as a call of a function for these shapes, which adds the terms in order."""
     build, (m, _, n) = writer.builder, block.sizes
     product = Table(writer, writer.double_type, length=m * n)
     signature = repr((block.sizes, block.strides, *(a.signature for a in args)))
     name = "product_" + hashlib.sha256(signature.encode()).hexdigest()[:16]
-    function = build.module.globals.get(name) or _write_product_function(writer, block, args, name)
+    function = build.module.globals.get(name) or _write_matrix_product_function(writer, block, args, name)
     build.call(function, [*(a.start for a in args), product.start])
     return BlockResults([], [product], m * n)
 
 
-def _write_product_function(writer: Any, block: MatrixProduct, tables: Sequence[Table], name: str) -> ir.Function:
+def _write_matrix_product_function(
+    writer: Any, block: MatrixProduct, tables: Sequence[Table], name: str
+) -> ir.Function:
     m, k, n = block.sizes
     function, function_writer = writer.new_function(
         name, [*(a.start.type for a in tables), writer.double_type.as_pointer()]
@@ -298,7 +300,7 @@ def _write_product_function(writer: Any, block: MatrixProduct, tables: Sequence[
     def write_sums(start: ir.Value, outer: ir.Value, width: int) -> None:
         entries = [build.add(start, int64(w)) for w in range(width)]
         entries = [(index, outer) if sums_run_over_rows else (outer, index) for index in entries]
-        totals = _allocate_slots(function_writer, "f" * width, [function_writer.constant(0.0)] * width)
+        totals = _store_in_new_slots(function_writer, "f" * width, [function_writer.constant(0.0)] * width)
         with function_writer.loop_range(int64(k)) as l:
             shared_factor = entry(1, l, outer) if sums_run_over_rows else entry(0, outer, l)
             for (i, j), total in zip(entries, totals, strict=True):

@@ -42,7 +42,7 @@ class MachineCode:
     def __init__(self, module: ir.Module | str, skip_optimisation: bool = False):
         text = self.ir_text = str(module)
         if lapack.SYMBOL_PREFIX in text:
-            lapack.bind_symbols()
+            lapack.bind_scipy_functions_in_llvm()
         with _lock:
             for self.skip_optimisation in (False, True) if skip_optimisation else (False,):
                 name = hashlib.sha256(
@@ -204,7 +204,7 @@ def _compile_evaluator(program: Program) -> MachineCode:
     with writer.loop_range(count) as i:
         starts = parameters, build.gep(points, [build.mul(i, writer.int64(len(point_names)))])
         result = build.gep(results, [build.mul(i, writer.int64(len(values)))])
-        (row,) = writer.write_as_doubles(
+        (row,) = writer.write_program_with_double_outputs(
             program, lambda array, entry: build.load(build.gep(starts[array], [writer.int64(entry)]))
         )
         for j, value in enumerate(row):

@@ -23,7 +23,7 @@ from ...tracing.caching import LRUCache
 from ...tracing.calls import deferred_p
 from ...tracing.scalarize import report_compiler_faults, scalarize
 from ..adaptive_steps import ATTEMPT_FIELDS, attempt_step, initial_adaptive_state
-from ..root_bracket import search_array_shape
+from ..root_bracket import packed_bracket_shape
 from ..solver_options import DEFAULT_OPTIONS, SolverOptions
 from ..stage_solver import StageSolution, solve_newton
 from ..status_codes import StatusCode
@@ -134,7 +134,7 @@ class CompiledStepLoop:
             self._shapes |= {
                 "jacobian_probe": jacobian_probe_shape(system, method, control),
                 "event_values": control.event_shape,
-                "root_bracket": search_array_shape(control.event_shape),
+                "root_bracket": packed_bracket_shape(control.event_shape),
             }
         step_program = self._trace_program(
             self.fields_after_step, (*self.step_inputs, *self.field_names), self.field_names
@@ -248,7 +248,7 @@ class CompiledStepLoop:
 
         ``parameters`` has shape (p,), or (trajectories, p) if some differ; ``planned_steps`` decides on optimisation.
         """
-        blocks = self.make_blocks({"x": x, **fields}, parameters)
+        blocks = self.blocks_from_fields({"x": x, **fields}, parameters)
         first_parameters = np.ascontiguousarray(
             parameters if np.ndim(parameters) == 1 else parameters[0], dtype=np.float64
         )
@@ -277,7 +277,7 @@ class CompiledStepLoop:
         """Return the shape of a field of one trajectory."""
         return self._shapes.get(name, ())
 
-    def make_blocks(self, fields: dict[str, Any], parameters=None) -> np.ndarray:
+    def blocks_from_fields(self, fields: dict[str, Any], parameters=None) -> np.ndarray:
         """Return blocks of trajectories with these fields and status 0; other fields are undefined."""
         if self._is_per_trajectory.any() and "p" not in fields:
             fields = fields | {"p": parameters[:, self._is_per_trajectory]}
@@ -364,7 +364,7 @@ class CompiledStepLoop:
             n_saves,
             steps_per_save,
         ]
-        increments = self.noise_by_lane_block(noise, n_blocks, n_saves * steps_per_save)
+        increments = self.noise_increments_by_lane_block(noise, n_blocks, n_saves * steps_per_save)
         arguments += [out.ctypes.data, n_saves * steps_per_save, increments.ctypes.data]
         newton_address = self.newton_address(is_needed=False)
         _, advance = self._loops.loop_functions(n_blocks * n_saves * steps_per_save)
@@ -374,12 +374,12 @@ class CompiledStepLoop:
             out.reshape(n_blocks, n_saves, width, lanes).transpose(0, 3, 1, 2).reshape(n_blocks * lanes, n_saves, width)
         )
 
-    def saved_fields_of_one(self, out: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the saved fields of a single trajectory by name, from rows of ``out``."""
+    def saved_fields_of_single_trajectory(self, saved_rows: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the saved fields of a single trajectory by name, from rows of ``saved_rows``."""
         ends = np.cumsum([self._layout.row_counts[name] for name in self.saved_fields])
-        arrays = np.split(out, ends[:-1], axis=-1)
+        arrays = np.split(saved_rows, ends[:-1], axis=-1)
         return {
-            name: values.reshape(len(out), *self.field_shape(name))
+            name: values.reshape(len(saved_rows), *self.field_shape(name))
             for name, values in zip(self.saved_fields, arrays, strict=True)
         }
 
@@ -388,7 +388,7 @@ class CompiledStepLoop:
         """Number of values of a trajectory at each save."""
         return sum(self._layout.row_counts[name] for name in self.saved_fields)
 
-    def noise_by_lane_block(self, noise: np.ndarray | None, n_blocks: int, n_steps: int) -> np.ndarray:
+    def noise_increments_by_lane_block(self, noise: np.ndarray | None, n_blocks: int, n_steps: int) -> np.ndarray:
         """Rearrange noise increments to the order of the loop, shape (blocks, steps, increments, lanes)."""
         n_increments = self._shapes["dW"][0]
         if not n_increments:
@@ -407,9 +407,9 @@ class CompiledStepLoop:
 
     def newton_address(self, is_needed: bool) -> int:
         """Return the address of Newton's method; 0 if it is not compiled yet and no step has needed it."""
-        return self._newton_address() if is_needed or self._newton_code is not None else 0
+        return self._compiled_newton_address() if is_needed or self._newton_code is not None else 0
 
-    def _newton_address(self) -> int:
+    def _compiled_newton_address(self) -> int:
         """Return the address of Newton's method, which is compiled at the first call."""
         with self._lock, report_compiler_faults():
             if self._newton_code is None:

@@ -220,12 +220,12 @@ def test_parameters_are_arguments(monkeypatch):
 @pytest.mark.parametrize("h", [0.01, lt.Adaptive(1e-6)], ids=["fixed", "adaptive"])
 def test_blocks_may_begin_at_any_number(h, monkeypatch):
     """Members have matrices of their own in memory that is not aligned to whole vectors, as NumPy's is not."""
-    g, make_blocks = mf.se(3), CompiledStepLoop.make_blocks
+    g, make_blocks = mf.se(3), CompiledStepLoop.blocks_from_fields
     arguments = random_systems.family(g), random_systems.states(g, 9), (0.0, 0.05), h, lt.MetriplecticMidpoint()
 
     def final_states(offset: int) -> np.ndarray:
         monkeypatch.setattr(
-            CompiledStepLoop, "make_blocks", lambda *fields: copy_at_offset(make_blocks(*fields), offset)
+            CompiledStepLoop, "blocks_from_fields", lambda *fields: copy_at_offset(make_blocks(*fields), offset)
         )
         many = lt.ensemble(*arguments, parameters=random_systems.parameters(g, 9), engine="compiled")
         assert many.ok.all()

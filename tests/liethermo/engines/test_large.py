@@ -77,7 +77,7 @@ def slowness_by_update(updates, rate):
     for update in updates:
         k = k + update
         iteration = iteration.next_state(k, DEFAULT_OPTIONS)
-        slowness.append(bool(iteration.is_slower_than(rate)))
+        slowness.append(bool(iteration.shrinks_slower_than(rate)))
     return slowness
 
 

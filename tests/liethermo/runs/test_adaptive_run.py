@@ -177,7 +177,7 @@ def test_the_array_engine_takes_over_amid_attempts_made_together(monkeypatch):
         raise UnsupportedPrimitive("newton", "in this test")
 
     array_run = run_with_engine("array")
-    monkeypatch.setattr(CompiledStepLoop, "_newton_address", solver)
+    monkeypatch.setattr(CompiledStepLoop, "_compiled_newton_address", solver)
     with pytest.warns(UserWarning, match="newton"):
         parts = run_with_engine("auto")
     assert calls
