@@ -141,7 +141,10 @@ def test_no_smaller_step_is_advised_where_none_helps(monkeypatch):
         array_engine.ArrayEngine, options=SolverOptions(max_fixed_point_iterations=1, max_newton_iterations=1)
     )
     monkeypatch.setattr("liethermo.engines.select_engine.ArrayEngine", hasty)
-    system = lt.LiePoissonSystem(mf.so(3), lambda p: jnp.sum(p**4), lt.Quadratic(np.ones(3)), lt.KillingDissipation())
+    # so fast that one iteration does not solve the shortest step
+    system = lt.LiePoissonSystem(
+        mf.so(3), lambda p: 1e3 * jnp.sum(p**4), lt.Quadratic(np.ones(3)), lt.KillingDissipation()
+    )
     solution = lt.integrate(system, [0.8, 0.5, 0.9], (0.0, 1.0), 0.25, on_failure="return", engine="array")
     assert solution.status.code == "not_converged"
     assert "Try a smaller step" not in solution.status.message
