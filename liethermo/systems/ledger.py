@@ -249,7 +249,7 @@ def linear_friction(coefficient, n: int, what: str) -> LinearFriction:
         raise InputError(f"{what} must have shape (), ({n},) or ({n}, {n}), got {R.shape}")
     if R.ndim == 2:
         return LinearFriction(checked_semidefinite(R, what, symmetric=False))
-    require_condition(R.min(), lambda r: r >= 0.0, f"{what} must be >= 0, got {{value:g}}; friction cannot add energy")
+    require_condition(R.min(), lambda r: r >= 0.0, f"{what} must be >= 0, got {{value:g}}; it would inject energy")
     return LinearFriction(R)
 
 
