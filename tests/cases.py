@@ -301,8 +301,11 @@ def few_combinations(**values):
     combinations_of_values = [
         tuple(list(of_argument)[i] for of_argument, i in zip(values.values(), case, strict=True)) for case in chosen
     ]
-    name_of = lambda value: getattr(value, "__name__", None) or str(value)  # noqa: E731
-    return pytest.mark.parametrize(tuple(values), combinations_of_values, ids=name_of)
+
+    def case_name(value) -> str:
+        return getattr(value, "__name__", None) or str(value)
+
+    return pytest.mark.parametrize(tuple(values), combinations_of_values, ids=case_name)
 
 
 def rows(audit, law):
