@@ -198,8 +198,7 @@ class Tree(metaclass=ListedType):
         baths : HeatBaths, optional
             The bath that the dampers of the joints heat. Without one their heat is lost, and the energy falls.
         torque : function of t and Pi, or of t, Pi and the attitude, or a list of them; optional
-            External torque on the whole about its centre of mass, in axes of the base, shape (3,): see
-            :mod:`liethermo.torques`.
+            External torque, shape (3,), on the whole about its centre of mass in axes of the base: see ``lt.torques``.
         motors : dict of float or of function from t, optional
             Torques of motors by the name of the body, as ``motor`` of a joint, which they replace.
         gravity : array, shape (3,), or lt.torques.Orbit; optional
@@ -213,6 +212,7 @@ class Tree(metaclass=ListedType):
         Raises
         ------
         InputError
+            If there is no joint, or one moves no inertia; for a motor without a joint, a torque or orbit on the ground.
         """
         if gravity is not None and not isinstance(gravity, Orbit):
             gravity = checked_finite(gravity, "gravity", 3)

@@ -98,10 +98,8 @@ class Ensemble(AuditableResult):
     relaxation_time : ndarray, shape (B,)
         ``int_0^T (S(T) - S(t)) dt / (S(T) - S(0))``, T the end of the trajectory: the time constant of an exponential
         relaxation that is over by T. Under a double bracket the energy replaces S. NaN if nothing relaxes.
-    smallest_energy, largest_energy : ndarray, shape (B,)
-        Extremes over every step, less the work done from outside.
-    end_time : ndarray, shape (B,)
-        Time reached.
+    smallest_energy, largest_energy, end_time : ndarray, shape (B,)
+        Extremes of the energy over every step, less the work done from outside, and the time reached.
     x0 : ndarray, shape (B, n); on sites, as x, with ``(*sites, d)`` instead of n
         Initial states.
     laws, engine, wall_time : Laws, str, float
@@ -172,6 +170,10 @@ class Ensemble(AuditableResult):
     def event_time(self) -> np.ndarray:
         """Times of the events, shape (B,); NaN if a trajectory has none."""
         return np.where(self.status == StatusCode.EVENT, self.end_time, np.nan)
+
+    def __repr__(self) -> str:
+        completed = int(np.sum(self.ok))
+        return f"Ensemble({len(self.status)} trajectories to t = {np.max(self.end_time):g}, {completed} completed)"
 
     # -- one trajectory -------------------------------------------------------------------------------------------
 
@@ -318,6 +320,7 @@ class Ensemble(AuditableResult):
         Raises
         ------
         InputError
+            If the name of a tolerance is unknown, or a tolerance is negative.
         """
         limits = Tolerances.with_defaults(energy=energy, entropy=entropy, **tolerances)
         has_stepped, drifts = self.steps > 0, self.evidence.drifts
@@ -339,10 +342,6 @@ class Ensemble(AuditableResult):
         return Audit(drift, min_entropy_increment, casimir_drift, residual, tuple(rows), coverage)
 
     # -- files --------------------------------------------------------------------------------------------------------
-
-    def __repr__(self) -> str:
-        completed = int(np.sum(self.ok))
-        return f"Ensemble({len(self.status)} trajectories to t = {np.max(self.end_time):g}, {completed} completed)"
 
     def to_xarray(self, units: Mapping[str, str] | None = None) -> xarray.Dataset:
         """Return an ``xarray.Dataset`` with coordinates ``trajectory`` and ``time``; all else is in attributes (JSON).

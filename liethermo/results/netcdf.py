@@ -145,6 +145,7 @@ class SaveableResult(metaclass=ListedABCMeta):
         Raises
         ------
         FileError, InputError
+            If the file cannot be written, or a name in ``units`` has no variable.
         """
         return write_dataset(self.to_xarray(units), path)
 

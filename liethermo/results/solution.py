@@ -292,6 +292,7 @@ class Solution(AuditableResult):
         Raises
         ------
         InputError
+            If the name of a tolerance is unknown, or a tolerance is negative.
 
         Examples
         --------

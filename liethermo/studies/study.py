@@ -284,6 +284,7 @@ class Study(metaclass=ListedType):
         Raises
         ------
         FileError, InputError
+            If there is no store, or a tolerance has an unknown name or is negative.
         """
         return audit_store(self.store, **tolerances)
 

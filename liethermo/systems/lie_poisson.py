@@ -168,7 +168,7 @@ class LiePoissonSystem(TorqueSystem):
         Parameters
         ----------
         x : array, shape (n,), or (..., n) with ``batch``; optional
-            A state, which is checked.
+            A state. InputError if it is none, or if both or neither of it and the angular velocity are given.
         batch : bool
             Whether leading axes are several states.
         angular_velocity : array, shape (3,), or (..., 3) with ``batch``; optional

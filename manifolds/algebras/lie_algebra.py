@@ -151,13 +151,11 @@ class LieAlgebra(StructureMethods):
     def from_brackets(cls, brackets, *, name: str = "g", basis=None) -> LieAlgebra:
         """Return the algebra with the given brackets of named basis elements; all other brackets are zero.
 
-        Antisymmetry fills in the opposite brackets.
-
         Parameters
         ----------
         brackets : dict
-            The brackets by pairs of names. A value is a name, such as ``"e3"`` or ``"-e3"``, a dictionary from names to
-            coefficients (int, Fraction or float), or 0.
+            The brackets by pairs of names; the opposite ones follow. A value is a name, such as ``"e3"`` or ``"-e3"``,
+            a dictionary from names to coefficients (int, Fraction or float), or 0.
         name : str
             The name in messages.
         basis : sequence of str, optional
@@ -278,7 +276,8 @@ class LieAlgebra(StructureMethods):
     def ad_star(self, x, mu) -> jax.Array:
         """Return the coadjoint operator ``ad*_x mu``, defined by ``<ad*_x mu, y> = <mu, [x, y]>`` [BFM, after 3.1].
 
-        ``x`` (an angular velocity for a body), ``mu`` (its angular momentum) and the result have shape (..., dim).
+        The last axes of ``x`` (1 / time for a body), ``mu`` (mass * length**2 / time) and the result have length dim;
+        ShapeError if they have not.
         """
         return jnp.einsum(
             "abc,...a,...c->...b", real_array(self.structure_constants), self._element(x, "x"), self._element(mu, "mu")
@@ -455,8 +454,8 @@ class LieAlgebra(StructureMethods):
         degree : int, optional
             The degree of all Casimirs that are returned.
         max_degree : int, optional
-            Return the Casimirs of all degrees from 1 to this one instead, by default to 4.
-
+            Return the Casimirs of all degrees from 1 to this one instead, by default to 4. ParameterError if both are
+            given, or one is no positive integer.
         """
         if degree is not None and max_degree is not None:
             raise ParameterError("casimirs takes degree or max_degree, not both. Give one of them")
