@@ -2,10 +2,9 @@
 
 It looks for console errors, files that do not load, links and anchors that lead nowhere, formulas and tables that stay
 raw, printed numbers that are not rounded, pages wider than their screen, tables and code that are clipped, text that a
-picture squeezes, and words that the search does not find. In the
-sources it looks for code in passing that is not true, numbers that differ from page to page, paragraphs that begin
-within a line, and code wider than a page. Pictures of pages, at two widths, light and dark, go to
-``docs/_build/screenshots``.
+picture squeezes, and words that the search does not find. In the sources it looks for code in passing that is not true,
+numbers that differ from page to page, paragraphs that begin within a line, and code wider than a page. Pictures of
+pages, at two widths, light and dark, go to ``docs/_build/screenshots``.
 """
 
 from __future__ import annotations

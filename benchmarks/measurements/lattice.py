@@ -179,15 +179,9 @@ def dipole_table(edges) -> Table:
 
 def seconds_per_step(works: dict, steps: int) -> dict[str, float]:
     """Return the processor seconds of a step of each work, a function of ``steps``, without the call itself."""
-    best_times = {name: [np.inf, np.inf] for name in works}
-    for turn in range(CUBE_ROUNDS + 1):  # the first one compiles
-        for name, work in works.items():
-            for i, count in enumerate((SHORT_STEPS, steps)):
-                start = time.process_time()
-                work(steps=count)
-                if turn:
-                    best_times[name][i] = min(best_times[name][i], time.process_time() - start)
-    return {name: (long - short) / (steps - SHORT_STEPS) for name, (short, long) in best_times.items()}
+    runs = {(name, n): functools.partial(work, steps=n) for name, work in works.items() for n in (SHORT_STEPS, steps)}
+    seconds = {run: timed.cpu_seconds for run, timed in race(runs, rounds=CUBE_ROUNDS).items()}
+    return {name: (seconds[name, steps] - seconds[name, SHORT_STEPS]) / (steps - SHORT_STEPS) for name in works}
 
 
 def growth_table(sizes) -> Table:
