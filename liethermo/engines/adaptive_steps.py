@@ -123,7 +123,8 @@ def accept_or_reject(
     if control.adaptive:
         x_before, x_after = (system.solved_subsystem(x)[1] for x in (old_state.x, new_state.x))
         norm = jnp.maximum(jnp.max(jnp.abs(x_before)), jnp.max(jnp.abs(x_after)))
-        relative_change = jnp.max(jnp.abs(x_after - x_before)) / jnp.where(norm > 0.0, norm, 1.0)
+        scale = jnp.where(norm > 0.0, norm, 1.0)
+        relative_change = jnp.max(jnp.abs(x_after - x_before)) / scale
         max_rate = jnp.maximum(max_rate, jnp.where(is_solved, relative_change / h, 0.0))
         time_fraction = h * max_rate  # of the time in which the state, at its fastest, changes by its norm
         allowed_error = jnp.maximum(
@@ -139,10 +140,8 @@ def accept_or_reject(
         accepted_step_size = step_size_after_acceptance(
             optimal_step, adaptive_state.optimal_step_size, h, next_step_size, power, control.max_step, method.explicit
         )
-        relative_tolerance = control.allowed_error(norm) / jnp.where(norm > 0.0, norm, 1.0)
-        accepted_step_size = jnp.minimum(
-            accepted_step_size, max_step_for_attitude(method, system, new_state.x, relative_tolerance)
-        )
+        max_step = max_step_for_attitude(method, system, new_state.x, control.allowed_error(norm) / scale)
+        accepted_step_size = jnp.minimum(accepted_step_size, max_step)
         optimal_step = jnp.where(
             h < TRUNCATED_STEP_RATIO * next_step_size, adaptive_state.optimal_step_size, optimal_step
         )

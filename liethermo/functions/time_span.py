@@ -447,7 +447,7 @@ class ContinuedSpline(FunctionWithBreaks):
 
     @property
     def known_span(self) -> tuple[float, float]:
-        start, *_, end = kinks_of_table(self.times, False) or (-math.inf, math.inf)
+        start, end = kinks_of_table(self.times, is_smooth=True) or (-math.inf, math.inf)
         return start, end
 
     def __call__(self, t) -> jax.Array:

@@ -186,7 +186,8 @@ def project_onto_levels(
         """
         end_state = x + (compensation + s.d)
         directions = correction_directions(system, end_state, end_gradients, leaf, momentum_dim)
-        change_vectors = change_vectors_at(end_state, end_gradients)
+        is_same = not leaf and not momentum_dim
+        change_vectors = directions if is_same else change_vectors_at(end_state, end_gradients)
         if len(blocks) == 1:
             lengths = jnp.stack([jnp.linalg.norm(v) for v in change_vectors])
         else:

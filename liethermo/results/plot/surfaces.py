@@ -163,9 +163,10 @@ def _conserved_and_changing(solution: Solution, system: System | None) -> tuple[
         energy = _vectorize_in_blocks(_restrict_to_body(system.energy, system))
         # the entropy of baths is no function of the body
         body_entropy = system.entropy if system.body_dim == system.dim else None
-        functions = recorded_functions_with_verdicts(system).items()
-        name, function = next(((name, J) for name, (J, is_conserved) in functions if is_conserved), (name, None))
-        function = body_entropy or function
+        function = body_entropy
+        if function is None:
+            functions = recorded_functions_with_verdicts(system).items()
+            name, function = next(((name, J) for name, (J, is_conserved) in functions if is_conserved), (name, None))
         entropy = None if function is None else _vectorize_in_blocks(_restrict_to_body(function, system))
     else:
         energy = _fit_quadric(solution.x) if solution.laws.energy == "conserved" else None
