@@ -445,7 +445,7 @@ def _jump_gain_table(jumps: tuple[Jump, ...]) -> tuple[np.ndarray, np.ndarray, n
 
 def _checked_rate_function(rate: Callable, i: int) -> Callable:
     """Return a rate function of omega and T, or of omega, T and t, tested at omega = T = 1 and t = 0."""
-    what = f"the rate of V[{i}] must be a number, or a function of omega and T, or of omega, T and t, that is >= 0"
+    what = f"the rate of V[{i}] must be a number, or a function of omega and T, or of omega, T and t, to a number >= 0"
     try:
         value = rate(*(1.0, 1.0, 0.0)[: 3 if _takes_time(rate) else 2])
     except TypeError as error:

@@ -138,7 +138,7 @@ class AttitudeSystem(LiftedSystem):
         mu = body.initial_state(mu, t, batch) if isinstance(body, DrivenSystem) else body.state(mu, batch)
         batch_shape = jnp.broadcast_shapes(mu.shape[:-1], g.shape[:-2])
         if batch_shape and not batch:
-            raise InputError(f"the attitude must have shape {self.group.identity.shape}, got {g.shape}")
+            raise InputError(f"a run has one attitude, of shape {self.group.identity.shape}, got {g.shape}")
         mu, g = jnp.broadcast_to(mu, (*batch_shape, mu.shape[-1])), jnp.broadcast_to(g, (*batch_shape, *g.shape[-2:]))
         if not self.impulse_dim:
             return self.join_state(mu, g)

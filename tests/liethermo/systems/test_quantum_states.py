@@ -448,7 +448,7 @@ BAD = {
     "must be lt.ThermalJumps": lambda q: lt.QuantumSystem(QUBIT, lt.DoubleBracket(1.0)),
     r"rate of V\[0\] must be a number, or a function .* got": lambda q: lt.ThermalJumps([(LOWER, lambda w, T: [w])]),
     "at omega = 1 and T = 1 it is -1": lambda q: lt.ThermalJumps([(LOWER, lambda w, T: -1.0)]),
-    r"that returns one: .*positional argument": lambda q: lt.ThermalJumps([(LOWER, lambda w: 1.0)]),
+    r"to a number >= 0: .*positional argument": lambda q: lt.ThermalJumps([(LOWER, lambda w: 1.0)]),
     r"got an array of float64, shape \(0, 0\)": lambda q: lt.QuantumSystem(np.zeros((0, 0))),
     "the observable must have shape": lambda q: q.expectation(q.state(RHO), np.eye(3)),
     "mixed, .* from 0 to 1, got 'half'": lambda q: q.state(RHO, mixed="half"),
