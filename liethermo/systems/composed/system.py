@@ -412,8 +412,8 @@ def _require_connected(graph: Edges, names: tuple[str, ...]) -> None:
     if labels.max() > 0:
         examples = [" and ".join(np.array(names)[labels == i][:2]) for i in (0, 1)]
         raise InputError(
-            f"the conductance has {labels.max() + 1} parts that exchange no heat, such as those of {examples[0]} and "
-            f"of {examples[1]}. Use connected=False to allow this"
+            f"the conductance has {labels.max() + 1} parts that exchange no heat, such as that of {examples[0]} and "
+            f"that of {examples[1]}. Use connected=False to allow this"
         )
 
 
