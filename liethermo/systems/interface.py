@@ -229,7 +229,7 @@ class SystemInterface(Geometry):
         if self.space is None:
             states = scale * np.random.default_rng(seed).standard_normal((count, self.dim))
         else:
-            states = np.asarray(self.space.to_vector(self.space.random(seed, (count,))))
+            states = np.array(self.space.to_vector(self.space.random(seed, (count,))))
         if self.baths is not None:
             states[..., self.body_dim :] *= min(1.0, 1.0 / scale) * self.baths.scale  # keeps temperatures finite
         return states
