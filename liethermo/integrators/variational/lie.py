@@ -163,6 +163,7 @@ class _LieStep(NamedTuple):
     t: jax.Array
 
     def _midpoint(self, y) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return the velocity xi, and the entropy and the time in the middle of the step."""
         return y[:-1], self.S0 + 0.5 * self.h * y[-1], self.t + 0.5 * self.h
 
     def momenta(self, y) -> tuple[jax.Array, jax.Array]:
