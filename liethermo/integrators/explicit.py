@@ -221,29 +221,31 @@ class ExplicitMethod(TransportingMethod):
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         """Return the rows of :class:`StepRow`; of the k passed in, only the initial levels are used."""
-        on_leaf, n, skip_law_rates = (
+        follow_leaf, n, skip_law_rates = (
             self._can_follow_symplectic_leaf(system),
             x.shape[0],
             has_generator(system) or not system.total_dissipation.terms,
         )
-        laws = self._laws_to_hold(system, on_leaf)
+        laws = self._laws_to_hold(system, follow_leaf)
         start_gradients = [law.function.gradient(x + compensation) for law in laws]
 
         def stage_rates(z) -> tuple[jax.Array, jax.Array]:
             """Return the rates of the state (and of the covector that carries it along a leaf) and of the laws."""
             field, changes = self.field_and_law_rates(system, laws, z[:n])
-            covector_rate = system.poisson.leaf_covector_rate(z[n:], system.energy.gradient(z[:n])) if on_leaf else None
+            covector_rate = (
+                system.poisson.leaf_covector_rate(z[n:], system.energy.gradient(z[:n])) if follow_leaf else None
+            )
             return field if covector_rate is None else jnp.append(field, covector_rate), changes
 
-        start, start_compensation = (jnp.append(v, jnp.zeros(n)) if on_leaf else v for v in (x, compensation))
+        start, start_compensation = (jnp.append(v, jnp.zeros(n)) if follow_leaf else v for v in (x, compensation))
         d, changes, error, interpolation_rows = self.base_step(
             stage_rates, skip_law_rates, start, start_compensation, h
         )
-        if on_leaf:
+        if follow_leaf:
             d, error, interpolation_rows = d[n:], error[:n], interpolation_rows[:, :n]
         if not isinstance(system, ChartSystem):  # in charts the initial levels are new at every step
             changes = changes + self._drift_correction_changes(
-                system, laws, start_gradients, x, compensation, k[StepRow.INITIAL_LEVELS], on_leaf
+                system, laws, start_gradients, x, compensation, k[StepRow.INITIAL_LEVELS], follow_leaf
             )
 
         def displacement_on_levels_and_residual(laws: list[Law]) -> tuple[jax.Array, jax.Array]:
@@ -257,7 +259,7 @@ class ExplicitMethod(TransportingMethod):
                 d,
                 changes[selection],
                 self.max_corrections,
-                on_leaf,
+                follow_leaf,
                 self._constant_length_momentum_dim(system),
             )
 
@@ -271,7 +273,7 @@ class ExplicitMethod(TransportingMethod):
         )
 
     def _drift_correction_changes(
-        self, system: System, laws: list[Law], gradients: list, x, compensation, levels, on_leaf: bool
+        self, system: System, laws: list[Law], gradients: list, x, compensation, levels, follow_leaf: bool
     ) -> jax.Array:
         """Return the changes of the conserved functions, shape (laws,), back to the levels at the start of the run.
 
@@ -301,7 +303,7 @@ class ExplicitMethod(TransportingMethod):
         )
 
         def gives_small_displacement(correction) -> jax.Array:
-            displacement = correction_displacement(system, x, correction, on_leaf, momentum_dim)
+            displacement = correction_displacement(system, x, correction, follow_leaf, momentum_dim)
             is_small = [
                 jnp.linalg.norm(displacement[b]) <= MAX_CORRECTION_DISPLACEMENT * jnp.linalg.norm(x[b])
                 for b in system.state_blocks
@@ -309,7 +311,7 @@ class ExplicitMethod(TransportingMethod):
             return jnp.stack(is_small).all()
 
         def changes_by_level_correction() -> jax.Array:  # the drifts, as far as the level correction can cancel them
-            directions = correction_directions(system, x, gradients, on_leaf, momentum_dim)
+            directions = correction_directions(system, x, gradients, follow_leaf, momentum_dim)
             correction = level_correction(system, directions, drifts, gives_small_displacement)
             return jnp.stack([jnp.dot(v, correction) for v in directions])
 
@@ -383,18 +385,18 @@ class ExplicitMethod(TransportingMethod):
             and jax.eval_shape(system.poisson.leaf_covector_rate, v, v) is not None
         )
 
-    def _laws_to_hold(self, system: System, on_leaf: bool = False) -> list[Law]:
+    def _laws_to_hold(self, system: System, follow_leaf: bool = False) -> list[Law]:
         """Return the laws onto whose levels steps are projected: conserved functions first, then monotone ones.
 
-        With ``on_leaf``, the list has no functions that are constant on a symplectic leaf.
+        With ``follow_leaf``, the list has no functions that are constant on a symplectic leaf.
         """
         functions = system.functions()
         laws = [Law(system.energy, LAW_SIGNS[system.energy_law])] if system.energy_law in LAW_SIGNS else []
         constant_names = set() if system.surface is None else {system.surface.name}
-        constant_names |= set(system.casimirs()) if on_leaf else set()
+        constant_names |= set(system.casimirs()) if follow_leaf else set()
         laws += [Law(functions[name], 0.0) for name in self.held if name not in constant_names]
         laws += [Law(C, 0.0) for C in self.functions]
-        if system.entropy_law in LAW_SIGNS and not on_leaf:
+        if system.entropy_law in LAW_SIGNS and not follow_leaf:
             assert system.entropy is not None
             laws.append(Law(system.entropy, LAW_SIGNS[system.entropy_law]))
         return sorted(laws, key=lambda law: law.sign != 0.0)

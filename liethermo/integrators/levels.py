@@ -108,15 +108,15 @@ def project_onto_levels(
     d,
     target_changes,
     max_corrections: int = MAX_PROJECTION_ITERATIONS,
-    on_leaf: bool = False,
+    follow_leaf: bool = False,
     momentum_dim: int = 0,
 ) -> tuple[jax.Array, jax.Array]:
     """Return the displacement nearest to d with the required changes of the functions, and its residual as a length.
 
     ``start_gradients`` are the gradients of the functions at x + compensation, ``target_changes`` the required changes.
-    With ``on_leaf`` the displacement is along the symplectic leaf, and d is the covector that carries the state. The
-    first ``momentum_dim`` components are a momentum of constant length, which corrections leave at zero, and move less
-    the smaller it is.
+    With ``follow_leaf`` the displacement is along the symplectic leaf, and d is the covector that carries the state.
+    The first ``momentum_dim`` components are a momentum of constant length, which corrections leave at zero, and move
+    less the smaller it is.
 
     Near an equilibrium the entropy is almost the largest that the conserved functions allow. If a step overestimates
     the production, the levels may have no common point. Corrections along gradients that depend on each other would
@@ -129,12 +129,12 @@ def project_onto_levels(
     functions, blocks = [law.function for law in laws], system.state_blocks
 
     def corrected_displacement_and_residual(s: ProjectionState) -> tuple[jax.Array, jax.Array]:
-        d = s.d + correction_displacement(system, x + (compensation + s.d), s.correction, on_leaf, momentum_dim)
+        d = s.d + correction_displacement(system, x + (compensation + s.d), s.correction, follow_leaf, momentum_dim)
         return (d, jnp.zeros(())) if surface is None else surface.project_displacement(x, compensation, d)
 
     def change_vectors_at(state, gradients) -> list[jax.Array]:
         """Return the vectors whose inner products with a displacement are the changes of the functions."""
-        if on_leaf:
+        if follow_leaf:
             return [system.raise_index(state, v) for v in gradients]
         return correction_directions(system, state, gradients)
 
@@ -185,8 +185,8 @@ def project_onto_levels(
         heat.
         """
         end_state = x + (compensation + s.d)
-        directions = correction_directions(system, end_state, end_gradients, on_leaf, momentum_dim)
-        is_same = not on_leaf and not momentum_dim
+        directions = correction_directions(system, end_state, end_gradients, follow_leaf, momentum_dim)
+        is_same = not follow_leaf and not momentum_dim
         change_vectors = directions if is_same else change_vectors_at(end_state, end_gradients)
         if len(blocks) == 1:
             lengths = jnp.stack([jnp.linalg.norm(v) for v in change_vectors])
@@ -312,7 +312,7 @@ def project_onto_levels(
         begin = x + compensation
         start_vectors = change_vectors_at(begin, start_gradients)
     zero_residual = jnp.zeros(len(laws))
-    start_d, start_correction = (jnp.zeros_like(d), -d) if on_leaf else (d, jnp.zeros_like(d))
+    start_d, start_correction = (jnp.zeros_like(d), -d) if follow_leaf else (d, jnp.zeros_like(d))
     s = with_next_correction(
         *apply_correction(ProjectionState(start_d, jnp.zeros(()), zero_residual, zero_residual, start_correction))
     )
@@ -338,17 +338,17 @@ def project_onto_levels(
 
 
 def correction_directions(
-    system: System, x, gradients: Sequence[jax.Array], on_leaf: bool = False, momentum_dim: int = 0
+    system: System, x, gradients: Sequence[jax.Array], follow_leaf: bool = False, momentum_dim: int = 0
 ) -> list[jax.Array]:
     """Return the directions, along the surface, in which functions with these gradients at x are corrected.
 
-    With ``on_leaf`` they are directions of the covectors that carry the state along its leaf. The first
+    With ``follow_leaf`` they are directions of the covectors that carry the state along its leaf. The first
     ``momentum_dim`` components are a momentum of constant length: see :func:`_small_momentum_weights`.
     """
     if momentum_dim:
         weights = _small_momentum_weights(system, x, momentum_dim)
         gradients = [weights * gradient for gradient in gradients]
-    if on_leaf:
+    if follow_leaf:
         gradients = [_symplectic_leaf_direction(system, x, gradient) for gradient in gradients]
     directions, surface = [system.raise_index(x, gradient) for gradient in gradients], system.surface
     return directions if surface is None else [surface.project_direction(x, v) for v in directions]
@@ -371,12 +371,14 @@ def level_correction(
     return vector_with_inner_products(directions, changes, min(len(system.state_blocks), 2), is_usable)
 
 
-def correction_displacement(system: System, x, correction, on_leaf: bool = False, momentum_dim: int = 0) -> jax.Array:
+def correction_displacement(
+    system: System, x, correction, follow_leaf: bool = False, momentum_dim: int = 0
+) -> jax.Array:
     """Return the displacement of x by a correction: the correction itself, or along a leaf that of its covector.
 
     The covector is minus the correction: ``dH . Pi K = -(Pi dH) . K`` gives its sign.
     """
-    if on_leaf:
+    if follow_leaf:
         return system.poisson.leaf_displacement(x, -correction)
     return _small_momentum_weights(system, x, momentum_dim) * correction if momentum_dim else correction
 
