@@ -143,7 +143,7 @@ class OneStepMethod(Module):
         return frozenset()
 
     def initial_compensation(self, system: System, x) -> jax.Array:
-        """Return the compensation at the start of a run, shape (n,): it leads from x to the surface of the system."""
+        """Return the compensation at the start of a run, shape (n,): the displacement from x to its surface."""
         nothing = jnp.zeros_like(x)
         return nothing if system.surface is None else system.surface.correct_rounding(x, nothing)[1]
 
@@ -156,7 +156,7 @@ class OneStepMethod(Module):
         return 2.0 * k - previous_k
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
-        """Return an estimate of the local error of a step, as a length like that of x; adaptive steps need it."""
+        """Return an estimate of the local error of a step, in the units of x; adaptive steps need it."""
         raise InputError(f"{self} has no error estimate: {self.why_fixed_step}")
 
     def attitude_rate(self, system: System, x) -> jax.Array:
@@ -216,7 +216,7 @@ class OneStepMethod(Module):
 
 
 class MethodWrapper(OneStepMethod):
-    """A method made from another one, with nearly the same slopes; undefined members are those of the inner method.
+    """A method that wraps an inner method and has nearly its slopes; members that it does not define are forwarded.
 
     Attributes
     ----------

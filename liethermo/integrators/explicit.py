@@ -72,7 +72,7 @@ have hardly any common point, and the initial levels may have none."""
 
 
 class UncorrectedStep(NamedTuple):
-    """A step before its corrections.
+    """An explicit step before its corrections onto the levels of the laws.
 
     Attributes
     ----------
@@ -320,7 +320,7 @@ class ExplicitMethod(TransportingMethod):
     def _project_conserved_first(
         self, laws: list[Law], x, compensation, project: Callable
     ) -> tuple[jax.Array, jax.Array]:
-        """Project a step onto the conserved levels; onto all levels if a function then changes with a wrong sign.
+        """Project a step onto the levels of conserved laws, or onto all levels if a monotone function then goes wrong.
 
         A function that rises or falls does so by the motion itself. A step with the wrong sign is therefore off the
         motion by at least the size of the second projection.

@@ -143,7 +143,7 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
         return self.method.preserves_function(system, name) and noise_invariance_by_name(system)[name]
 
     def check(self, system: System) -> None:
-        """Raise InputError if the dissipation has no noise that belongs to it."""
+        """Raise InputError unless ``B B^T`` equals the friction matrix K of the dissipation, to FACTOR_RTOL."""
         self.method.check(system)
         residual = np.nanmax(_factor_residuals_and_noise_changes_at_samples(system)[0], initial=0.0)
         if not residual <= FACTOR_RTOL:

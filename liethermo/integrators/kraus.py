@@ -127,7 +127,7 @@ class KrausMethod(OneStepMethod):
 
 
 class _StepChannel(NamedTuple):
-    """The completely positive map of a step.
+    """The completely positive map of a step of Lindblad's equation.
 
     Attributes
     ----------
@@ -236,7 +236,9 @@ def _inverse_square_root(p):
 
 
 def _magnus_exponents(J0, J, J1, h, intervals) -> list[jax.Array]:
-    """Return the exponents of W over parts of a step, of order 4, from ``-i H - ...`` at its start, middle and end.
+    """Return the exponents of Magnus' expansion of order 4 on intervals of a step, shape (N, N) each.
+
+    J0, J and J1 are the generator ``-i H - ...`` of the propagator W at the start, the middle and the end of the step.
 
     Over a step ``-i H - ...`` is replaced by a quadratic polynomial in time [Blanes et al. 2009].
     """

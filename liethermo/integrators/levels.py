@@ -157,7 +157,7 @@ def project_onto_levels(
         return target_changes - jnp.stack([jnp.dot(gradient, d) for gradient in gradients])
 
     def apply_correction(s: ProjectionState) -> tuple[ProjectionState, list]:
-        """Apply the correction, and return the state with its new residuals and the gradients there."""
+        """Apply the next correction of a projection; return its state with new residuals, and the gradients there."""
         d, surface_residual = corrected_displacement_and_residual(s)
         end_gradients = [f.gradient(x + (compensation + d)) for f in functions]
         return s._replace(

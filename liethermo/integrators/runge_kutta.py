@@ -173,7 +173,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
         return hermite_cubic_weights(theta, self.stages)
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
-        """Return the larger one of the two estimates of :class:`.tableaus.ExplicitTableau`."""
+        """Return the larger one of two error estimates, one for linear equations and one for quadratures."""
         t, step_length = self.tableau, h * jnp.max(jnp.abs(k[StepRow.MEAN_SLOPE]))
 
         def estimated_error(estimate: ErrorEstimate, row: int) -> jax.Array:

@@ -134,7 +134,7 @@ class ErrorEstimate(NamedTuple):
 
 
 class ExplicitTableau(NamedTuple):
-    """Stages ``X_i = x + h sum_j A_ij k_j`` and step ``x' = x + h sum_i b_i k_i``.
+    """Tableau of an explicit Runge-Kutta method: ``X_i = x + h sum_j A_ij k_j``, ``x' = x + h sum_i b_i k_i``.
 
     Attributes
     ----------

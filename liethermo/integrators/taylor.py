@@ -33,7 +33,7 @@ DEFAULT_RTOL = 1e-10
 
 
 def order_for_tolerance(tolerance: float | None) -> int:
-    """Return the order for a relative tolerance [Jorba & Zou 2005]."""
+    """Return the order of a Taylor method for a relative tolerance, by default DEFAULT_RTOL [Jorba & Zou 2005]."""
     order = math.ceil(1.0 - 0.5 * math.log(DEFAULT_RTOL if tolerance is None else tolerance))
     return min(max(MIN_ORDER, order), MAX_ORDER)
 

@@ -255,7 +255,7 @@ class DiscreteSystem(Module):
         return Pair(q0, (q1 - q0) / self.h, S0, (S1 - S0) / self.h)
 
     def lagrangian(self, q0, q1, S0, S1) -> jax.Array:
-        """Return ``L_d`` [GBY 3.10]."""
+        """Return the discrete Lagrangian ``L_d`` of a step, shape () [GBY 3.10]."""
         return self.h * self.mean_lagrangian(*self.pair(q0, q1, S0, S1))
 
     def forces(self, q0, q1, S0, S1, friction: bool = True, external: bool = True) -> tuple[jax.Array, jax.Array]:
@@ -264,7 +264,7 @@ class DiscreteSystem(Module):
         return self.h * force_at_start, self.h * force_at_end
 
     def constraint(self, q0, q1, S0, S1) -> jax.Array:
-        """Return ``P_d``, which vanishes for a pair on ``C_K^d`` [GBY 3.8]."""
+        """Return the value ``P_d`` of the discrete constraint, zero for a pair on ``C_K^d``, shape () [GBY 3.8]."""
         return -self.constraint_residual(self.pair(q0, q1, S0, S1))
 
     def momenta(self, q0, q1, S0, S1) -> tuple[jax.Array, jax.Array]:
@@ -275,7 +275,10 @@ class DiscreteSystem(Module):
         return tangential_part(q0, -dL_dq0 - force_minus), tangential_part(q1, dL_dq1 + force_plus)
 
     def momentum_and_constraint_jacobian(self, q0, q1, S0, S1) -> jax.Array:
-        """Return the matrix (3.13), shape (n + 1, n + 1): if it is invertible, q_1 and S_1 determine the step."""
+        """Return the Jacobian (3.13) of momentum and constraint by (q_1, S_1), shape (n + 1, n + 1).
+
+        If it is invertible, the momentum and the constraint determine q_1 and S_1, and so the step.
+        """
 
         def momentum_and_constraint(q1, S1):
             return -self.momenta(q0, q1, S0, S1)[0], self.constraint(q0, q1, S0, S1)
@@ -284,12 +287,15 @@ class DiscreteSystem(Module):
         return jnp.block([[A, B[:, None]], [C[None], D[None, None]]])
 
     def reduced_regularity_matrix(self, q0, q1, S0, S1) -> jax.Array:
-        """Return the matrix (3.15), shape (n, n): (3.13) is invertible if (3.15) is, and ``D_4 P_d`` is not zero."""
+        """Return the Schur complement (3.15) of the Jacobian (3.13), with S_1 eliminated, shape (n, n).
+
+        (3.13) is invertible if (3.15) is, and ``D_4 P_d`` is not zero.
+        """
         matrix = self.momentum_and_constraint_jacobian(q0, q1, S0, S1)
         return matrix[:-1, :-1] - jnp.outer(matrix[:-1, -1], matrix[-1, :-1]) / matrix[-1, -1]
 
     def end_entropy_on_constraint(self, q0, q1, S0) -> jax.Array:
-        """Return S_1 with ``P_d(q_0, q_1, S_0, S_1) = 0``, by Newton steps of a fixed number; differentiable."""
+        """Return S_1 with ``P_d(q_0, q_1, S_0, S_1) = 0``, after NEWTON_STEPS Newton steps; it is differentiable."""
         V = (q1 - q0) / self.h
         return S0 + self.h * newton_iterate(
             lambda s: self.constraint_residual(Pair(q0, V, S0, s)), jnp.zeros(()), NEWTON_STEPS

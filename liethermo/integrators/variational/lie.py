@@ -202,7 +202,10 @@ class _LieStep(NamedTuple):
 
 @jit_cached
 def _group_increments(method: LieVariational, system: EulerPoincareClosedSystem, x, h):
-    """Return ``tau(h xi_k)`` of every step, with xi_k from the momentum before it, shape (steps, m, m)."""
+    """Return the group increments ``tau(h xi_k)`` of all steps of a run, shape (steps, m, m).
+
+    The velocity xi_k of a step follows from the momentum at its start.
+    """
     tau = cayley if method.tau == "cayley" else exp
 
     def group_increment(x0, x1):

@@ -141,7 +141,7 @@ class VariationalIntegrator(OneStepMethod):
 
     @property
     def _has_symmetric_curves(self) -> bool:
-        """True if the curves on a manifold are the same from both ends."""
+        """True if the curve from q_1 to q_0 on a manifold is that from q_0 to q_1, run backward."""
         return self.retraction in SYMMETRIC_RETRACTION_NAMES or isinstance(self.retraction, SYMMETRIC_RETRACTION_TYPES)
 
     uses_charts = False
@@ -399,7 +399,7 @@ def _step_energies(method: VariationalIntegrator, system: SimpleClosedSystem, h,
 
 @jit_cached
 def _regularity_matrix(discrete: DiscreteSystem, q0, q1, S0, S1):
-    """Return the compiled matrix (3.13), shape (n + 1, n + 1)."""
+    """Return the Jacobian (3.13) of momentum and constraint, shape (n + 1, n + 1), by a compiled program."""
     return discrete.momentum_and_constraint_jacobian(q0, q1, S0, S1)
 
 
