@@ -23,7 +23,7 @@ from manifolds._precision import with_library_settings
 from manifolds._pytree_module import Module, forward_to
 
 from ..errors import FunctionError, InputError
-from ..tracing.programs import subprogram
+from ..tracing.programs import jit_subprogram
 from ..tracing.short_form import short_form
 from .conditions import checked_numbers
 from .indices import ComponentMap, Components, check_coordinates, clique_pattern, sparsity_pattern, union_pattern
@@ -43,7 +43,7 @@ from .time_span import (
 )
 
 
-@subprogram
+@jit_subprogram
 def _gradient(energy: Energy, x) -> jax.Array:
     return jax.grad(energy.value)(x)
 

@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..systems import System
 from ..systems.clock import error_of_step
 from ..systems.transport import has_generator
-from ..tracing.taylor import TaylorSeriesError, check_taylor_series, increment_taylor_coefficients
+from ..tracing.taylor import TaylorSeriesError, check_taylor_series, solution_taylor_coefficients
 from .base import OneStepMethod, register
 from .charts import resolve_retraction
 from .explicit import ExplicitMethod, StepRow, UncorrectedStep
@@ -144,7 +144,7 @@ class MetriplecticTaylor(ExplicitMethod):
     def base_step(self, rates: Callable, skip_law_rates: bool, x, compensation, h) -> UncorrectedStep:
         nodes, b = self._lobatto_rule
         powers = np.arange(1.0, self.order + 1.0)
-        c = increment_taylor_coefficients(
+        c = solution_taylor_coefficients(
             lambda y: rates(y)[0], x, h, self.order
         )  # compensation is left out: in a chart x is its centre, exactly
         points = jnp.concatenate([x[None], x + (compensation + nodes[1:, None] ** powers @ c)])

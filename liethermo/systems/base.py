@@ -23,7 +23,7 @@ from ..functions.bath_energy import BodyBathsEnergy
 from ..functions.checks import checked_energy, trace_energies, with_polynomial_degrees
 from ..functions.energy import Energy, make_energy
 from ..functions.on_spaces import energy_of_vectors, flatten_site_functions
-from ..tracing.short_form import arguments_form
+from ..tracing.short_form import format_arguments
 from ..tracing.traced import trace_callables
 from .baths import BathEntropy, HeatBaths, poisson_with_baths
 from .check import AXIOM_TOLERANCE, CheckReport, check_system, require_axioms
@@ -71,7 +71,7 @@ class System(SystemInterface):
             "torque": self.torque_laws.name,
         }
         name = f"{self.dim} components" if state_space is None else state_space.name
-        return f"{type(self).__name__}({name}, {arguments_form(parts)})"
+        return f"{type(self).__name__}({name}, {format_arguments(parts)})"
 
     @with_library_settings
     def _build(

@@ -21,7 +21,7 @@ from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers
 from ..functions.energy import Energy, Sum
 from ..functions.mechanics import Each
-from ..tracing.short_form import arguments_form
+from ..tracing.short_form import format_arguments
 
 
 class HeatBaths(Module):
@@ -75,8 +75,8 @@ class HeatBaths(Module):
 
     def __repr__(self) -> str:
         if isinstance(self.energy, BathEnergy):
-            return f"HeatBaths({arguments_form(vars(self.energy))})"
-        return f"HeatBaths({arguments_form(vars(self))})"
+            return f"HeatBaths({format_arguments(vars(self.energy))})"
+        return f"HeatBaths({format_arguments(vars(self))})"
 
     def __init__(self, capacity=1.0, temperature=1.0, number: int | None = None, energy=None):
         if number is None:

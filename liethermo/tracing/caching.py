@@ -122,7 +122,7 @@ _content_cache: LRUCache[tuple[Any, _Content]] = LRUCache(MAX_CACHED_RESULTS, MA
 
 
 def _content_of(argument: Any) -> _Content:
-    """Return the content of an argument, cached by its identity."""
+    """Return the key and size of an argument's content, cached by the identity of the argument."""
     entry = _content_cache.get(id(argument))
     if entry is not None:
         return entry[1]

@@ -61,10 +61,10 @@ def checked_result_shapes(function: Callable, *arguments) -> Any:
 def _check_and_evaluate_indices(
     jaxpr: Jaxpr, consts: Sequence, arguments: Sequence, table_errors: list[IndexOutOfRangeError]
 ) -> list:
-    """Check a jaxpr; return the constant integers among its results as arrays, None for each other result.
+    """Check the indices in a jaxpr; return the results that are constant integers as arrays, None for the others.
 
-    The arguments have the form of the results. A single wrong index raises an error; the error of a wrong index in a
-    table is appended to ``table_errors``.
+    The arguments are constant integers or None too. A single wrong index raises an error; the error of a wrong index in
+    a table is appended to ``table_errors``.
     """
     constants = dict(zip(jaxpr.invars, arguments, strict=True))
     constants.update((v, _constant_indices(c)) for v, c in zip(jaxpr.constvars, consts, strict=True))
@@ -160,14 +160,17 @@ def _invalid_indices(eqn, constant_inputs: Sequence) -> Iterator[tuple[int, int]
 
 
 def _dynamic_slice_accesses(eqn, constant_inputs):
+    """Yield (axis, start of window, length of window) for each constant index of a ``dynamic_slice``."""
     yield from _slice_accesses(constant_inputs[1:], eqn.params["slice_sizes"])
 
 
 def _dynamic_update_accesses(eqn, constant_inputs):
+    """Yield (axis, start of window, length of window) for each constant index of a ``dynamic_update_slice``."""
     yield from _slice_accesses(constant_inputs[2:], eqn.invars[1].aval.shape)
 
 
 def _slice_accesses(starts, window_lengths):
+    """Yield (axis, start of window, length of window) for each axis whose start is constant."""
     yield from ((axis, s, w) for axis, (s, w) in enumerate(zip(starts, window_lengths, strict=True)) if s is not None)
 
 
@@ -182,6 +185,7 @@ def is_silently_clamped(eqn) -> bool:
 
 
 def _gather_accesses(eqn, constant_inputs):
+    """Yield (axis, starts of windows, length of window) for each indexed axis of a gather with constant indices."""
     if is_silently_clamped(eqn):
         yield from _accesses_by_axis(
             constant_inputs[1], eqn.params["dimension_numbers"].start_index_map, eqn.params["slice_sizes"]
@@ -189,6 +193,7 @@ def _gather_accesses(eqn, constant_inputs):
 
 
 def _scatter_accesses(eqn, constant_inputs):
+    """Yield (axis, starts of windows, length of window) for each indexed axis of a scatter with constant indices."""
     numbers = eqn.params["dimension_numbers"]
     if is_silently_clamped(eqn):
         unit_axes = {*numbers.inserted_window_dims, *numbers.operand_batching_dims}
@@ -198,6 +203,7 @@ def _scatter_accesses(eqn, constant_inputs):
 
 
 def _accesses_by_axis(indices, axes, window_lengths):
+    """Yield (axis, starts of windows, length of window) for each column of ``indices``; none if they are None."""
     if indices is not None and indices.size:
         yield from ((int(axis), indices[..., i], int(window_lengths[axis])) for i, axis in enumerate(axes))
 

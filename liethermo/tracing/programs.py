@@ -66,7 +66,7 @@ def host_processor() -> tuple[str, str, str]:
 
 def read_machine_code(name: str, suffix: str = ".o") -> bytes | None:
     """Return the machine code written under ``name``; None if it is missing, damaged, or may be another user's."""
-    folder = _trusted_folder()
+    folder = _trusted_cache_folder()
     if folder is None:
         return None
     try:
@@ -88,14 +88,14 @@ def read_machine_code(name: str, suffix: str = ".o") -> bytes | None:
 
 def write_machine_code(name: str, code: bytes, suffix: str = ".o") -> None:
     """Write machine code to the cache under ``name``, if there is a folder that can be used."""
-    folder = _trusted_folder()
+    folder = _trusted_cache_folder()
     if folder is not None:
         with contextlib.suppress(OSError):
             disk.write_atomically(folder / f"{name}{suffix}", hashlib.sha256(code).digest() + code, mode=0o600)
             disk.remove_abandoned_files(folder, f"{name}{suffix}")
 
 
-def _trusted_folder() -> Path | None:
+def _trusted_cache_folder() -> Path | None:
     """Return the cache folder, created if necessary; None if it cannot be used or others might write to it."""
     folder = cache_folder()
     if folder is None:
@@ -175,8 +175,8 @@ def jit_unoptimised(function: FunctionT) -> FunctionT:
     return _jit_with_options(function, UNOPTIMISED_XLA_OPTIONS)
 
 
-def subprogram(function: FunctionT) -> FunctionT:
-    """Decorator: trace a function of pytrees once for all places where a program calls it.
+def jit_subprogram(function: FunctionT) -> FunctionT:
+    """Decorator: trace a function of pytrees once, as a jitted subprogram of every program that calls it.
 
     The function is called directly if no argument is traced, or if an argument cannot be hashed.
     """
@@ -185,7 +185,7 @@ def subprogram(function: FunctionT) -> FunctionT:
     def call(*arguments):
         if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(arguments)):
             return function(*arguments)
-        array_function, dynamic, key = _split_arguments(function, arguments)
+        array_function, dynamic, key = _split_static_and_dynamic_arguments(function, arguments)
         try:
             hash(key)
         except TypeError:
@@ -196,13 +196,17 @@ def subprogram(function: FunctionT) -> FunctionT:
 
 
 def _jit_with_options(function: FunctionT, options: dict | None) -> FunctionT:
+    """Return a function that compiles itself with options of XLA, or becomes a part of a program that is traced."""
+
     @functools.wraps(function)
     def call(*arguments):
-        array_function, dynamic, key = _split_arguments(function, arguments)
+        array_function, dynamic, key = _split_static_and_dynamic_arguments(function, arguments)
         is_part_of_program = _is_being_traced(dynamic)
         program = _program_cache.get_or_compute(
             (key, is_part_of_program),
-            lambda: jax.jit(array_function) if is_part_of_program else _compile(array_function, dynamic, options),
+            lambda: (
+                jax.jit(array_function) if is_part_of_program else _compile_or_load(array_function, dynamic, options)
+            ),
         )
         return program(dynamic)
 
@@ -210,7 +214,7 @@ def _jit_with_options(function: FunctionT, options: dict | None) -> FunctionT:
 
 
 def _is_being_traced(arrays: tuple) -> bool:
-    """Return whether a call belongs to a program that is being traced, whose own options apply."""
+    """Return whether a program is being traced, of which a call with these arrays becomes a part."""
     return is_traced(arrays, jnp.zeros(()))
 
 
@@ -221,8 +225,8 @@ MIN_STORED_COMPILE_SECONDS = 0.1
 """Shortest time in seconds of a compilation whose result is written to disk."""
 
 
-def _compile(function: Callable, arguments: tuple, options: dict | None) -> Callable:
-    """Return the program of a function of arrays, from the cache on disk or compiled by XLA.
+def _compile_or_load(function: Callable, arguments: tuple, options: dict | None) -> Callable:
+    """Return the compiled program of a function of arrays, loaded from the cache on disk or compiled by XLA.
 
     The cache is found by the text of the program, so it never returns the program of another function. Programs that
     call Python, or that run on accelerators or on several devices, are not cached, nor any if JAX's own cache is on:
@@ -238,7 +242,7 @@ def _compile(function: Callable, arguments: tuple, options: dict | None) -> Call
     if "callback" in text:
         return lowered.compile()
     name = hashlib.sha256(f"{_compiler_identity()} {options}\n{text}".encode()).hexdigest()[:32]
-    if (program := _stored_program(name, lowered)) is not None:
+    if (program := _load_stored_program(name, lowered)) is not None:
         return program
     start = time.perf_counter()
     compiled = lowered.compile()
@@ -251,8 +255,8 @@ XLA_SUFFIX = ".xla"
 """Suffix of the files of programs that XLA compiled."""
 
 
-def _stored_program(name: str, lowered: Any) -> Callable | None:
-    """Return the program written to disk under ``name``; None if there is none that can be loaded."""
+def _load_stored_program(name: str, lowered: Any) -> Callable | None:
+    """Load the compiled program that was written to disk under ``name``; None if there is none that can be loaded."""
     code = read_machine_code(name, XLA_SUFFIX)
     if code is None:
         return None
@@ -277,8 +281,11 @@ def _strip_weak_type(array):
     return np.asarray(array) if is_weak else array
 
 
-def _split_arguments(function: Callable, arguments: tuple) -> tuple[_ArrayFunction, tuple, tuple]:
-    """Split arguments into a function of their arrays alone, these arrays, and a hashable key of all the rest."""
+def _split_static_and_dynamic_arguments(function: Callable, arguments: tuple) -> tuple[_ArrayFunction, tuple, tuple]:
+    """Return a function of the arrays among the arguments alone, these arrays, and a key of everything else.
+
+    The key can be hashed if the other arguments can; it contains the shapes and dtypes of the arrays.
+    """
     leaves, structure = jax.tree_util.tree_flatten(arguments)
     dynamic = tuple(_strip_weak_type(leaf) if eqx.is_array(leaf) else None for leaf in leaves)
     static = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
