@@ -144,8 +144,8 @@ class AdiabaticJumps(ThermalJumps):
         levels, vectors, V, omega, rates = self._jumps_at(system, dH, T)
         rho, A = (adjoint(vectors) @ structure.matrix(a[:n]) @ vectors for a in (x, dS))
         gaps = levels[None, :] - levels[:, None]
-        bath_terms = (dS[n + self.bath] * V * gaps - omega[:, None, None] * V) / T
-        image = friction_image(rho, matrix_logarithm(rho), A, V, omega / (2.0 * T), bath_terms)
+        bath_energy_terms = (dS[n + self.bath] * V * gaps - omega[:, None, None] * V) / T
+        image = friction_image(rho, matrix_logarithm(rho), A, V, omega / (2.0 * T), bath_energy_terms)
         drho = jnp.sum(commutator(adjoint(V), image * rates[:, None, None]), axis=0)
         return self._with_bath_entropy(system, T, levels, vectors, drho)  # the adjoints add the adjoint
 

@@ -209,13 +209,13 @@ class ThermalJumps(Dissipation):
             self._jump_frequencies(structure, dH[:n]),
         )
         T = jnp.asarray(jnp.inf) if self.is_isolated else dH[n + self.bath]
-        bath_terms = None
+        bath_energy_terms = None
         if not self.is_isolated:
             # Differences of levels lose no digits; the off-diagonal entries of H are mostly zero.
             levels, off_diagonal = self._energies_in_jump_frame(structure, dH[:n]), 1.0 - np.eye(structure.size)
             H_commutators = V * (levels[None, :] - levels[:, None]) + commutator(V, H * off_diagonal)
-            bath_terms = (dS[n + self.bath] * H_commutators - omega[:, None, None] * V) / T
-        image = friction_image(rho, logs, A, V, omega / (2.0 * T), bath_terms)
+            bath_energy_terms = (dS[n + self.bath] * H_commutators - omega[:, None, None] * V) / T
+        image = friction_image(rho, logs, A, V, omega / (2.0 * T), bath_energy_terms)
         drho = jnp.sum(
             commutator(V_adjoint, image * self._weighted_jump_rates(system, omega, T)[:, None, None]), axis=0
         )
@@ -360,11 +360,11 @@ def _common_eigenvectors(hamiltonians: Sequence[np.ndarray]) -> np.ndarray:
     return np.eye(len(H)) if is_diagonal(H) else np.linalg.eigh(H)[1]
 
 
-def friction_image(rho, logs, A, V, shift, bath_terms) -> jax.Array:
+def friction_image(rho, logs, A, V, shift, bath_energy_terms) -> jax.Array:
     """Return ``L B`` of jumps at a covector, shape (jumps, N, N), in a frame in which all matrices are given.
 
-    The logarithm of rho is taken out of the gradient A of the entropy: without A - (-ln rho) and ``bath_terms`` the
-    result is that of Lindblad's equation.
+    The logarithm of rho is taken out of the gradient A of the entropy: without A - (-ln rho) and
+    ``bath_energy_terms`` the result is that of Lindblad's equation.
 
     Parameters
     ----------
@@ -373,12 +373,12 @@ def friction_image(rho, logs, A, V, shift, bath_terms) -> jax.Array:
     V : array, shape (jumps, N, N)
     shift : array, shape (jumps,)
         ``omega / 2T``.
-    bath_terms : array, shape (jumps, N, N), or None
+    bath_energy_terms : array, shape (jumps, N, N), or None
         ``(dS_bath [V, H] - omega V) / T``.
     """
     commutators = commutator(V, A + logs)
-    if bath_terms is not None:
-        commutators = commutators - bath_terms
+    if bath_energy_terms is not None:
+        commutators = commutators - bath_energy_terms
     boltzmann_factors = jnp.exp(shift)[:, None, None]
     return rho @ V / boltzmann_factors - boltzmann_factors * (V @ rho) + log_mean(logs, shift, commutators)
 

@@ -234,7 +234,7 @@ class MeanEnergy(Linear):
     b : array, shape (N^2,)
         The coordinates of H.
     reference_level : array, shape ()
-        The energy e: see :func:`choose_reference_level`. It affects rounding only.
+        The energy e: see :func:`lower_level_of_smallest_gap`. It affects rounding only.
     """
 
     reference_level: jax.Array
@@ -249,11 +249,10 @@ class MeanEnergy(Linear):
         return MeanEnergy(-self.b, -self.reference_level)
 
 
-def choose_reference_level(levels: np.ndarray) -> float:
-    """Return the lower level of the pair with the smallest gap; as the zero of energy it keeps all digits of the
-    gap.
+def lower_level_of_smallest_gap(levels: np.ndarray) -> float:
+    """Return the lower one of the two levels, among levels of shape (N,), that are separated by the smallest gap.
 
-    It grows by c if all levels, shape (N,), do.
+    With this level as the zero of energy, the gap keeps all its digits. The result grows by c if all levels do.
     """
     sorted_levels = np.sort(levels)
     return float(sorted_levels[0 if len(sorted_levels) == 1 else np.argmin(np.diff(sorted_levels))])

@@ -26,7 +26,14 @@ from ..errors import FunctionError, InputError
 from ..tracing.programs import jit_subprogram
 from ..tracing.short_form import short_form
 from .conditions import checked_numbers
-from .indices import ComponentMap, Components, check_coordinates, clique_pattern, sparsity_pattern, union_pattern
+from .indices import (
+    ComponentMap,
+    Components,
+    check_coordinates_are_quadratic,
+    clique_pattern,
+    sparsity_pattern,
+    union_pattern,
+)
 from .path import CollocationPath, DiscreteGradientScheme
 from .rounding import value_and_rounding_scale
 from .time_span import (
@@ -44,7 +51,8 @@ from .time_span import (
 
 
 @jit_subprogram
-def _gradient(energy: Energy, x) -> jax.Array:
+def _autodiff_gradient(energy: Energy, x) -> jax.Array:
+    """Return the gradient of an energy at a state, computed by JAX."""
     return jax.grad(energy.value)(x)
 
 
@@ -52,7 +60,7 @@ MIN_BUFFERED_DIM = 1_000
 """Number of components from which a gradient is stored in memory before it is used."""
 
 
-def _evaluate_buffered(function: Callable, x) -> jax.Array:
+def _evaluate_into_buffer(function: Callable, x) -> jax.Array:
     """Return ``function(x)``, of the shape of x, computed once and stored; NaN if the first entry of x is not finite.
 
     XLA would compute elementwise results anew for each use of an entry, but it stores the result of a branch.
@@ -80,7 +88,11 @@ class Energy(Module):
     def gradient(self, x) -> jax.Array:
         """Return the gradient at one state, shape (n,)."""
         x = float64_array(x)
-        return _gradient(self, x) if x.size < MIN_BUFFERED_DIM else _evaluate_buffered(lambda x: _gradient(self, x), x)
+        return (
+            _autodiff_gradient(self, x)
+            if x.size < MIN_BUFFERED_DIM
+            else _evaluate_into_buffer(lambda x: _autodiff_gradient(self, x), x)
+        )
 
     def sensitivity(self, x) -> jax.Array:
         """Return the scale ``|grad f(x)| |x|`` of the errors that rounding of x causes; for a sum, added over terms.
@@ -269,17 +281,17 @@ class Quadratic(Energy):
 
     is_quadratic = True
 
-    def linear_part(self, x) -> jax.Array:
-        """Return ``A x``."""
+    def apply_matrix(self, x) -> jax.Array:
+        """Return the matrix of the quadratic form times x, shape (n,)."""
         return self.A * x if self.A.ndim == 1 else self.A @ x
 
     def value(self, x) -> jax.Array:
         linear = 0.0 if self.b is None else jnp.dot(self.b, x)
-        return 0.5 * jnp.dot(x, self.linear_part(x)) + linear + self.c
+        return 0.5 * jnp.dot(x, self.apply_matrix(x)) + linear + self.c
 
     def gradient(self, x) -> jax.Array:
-        linear_part = self.linear_part(float64_array(x))
-        return linear_part if self.b is None else linear_part + self.b
+        matrix_vector_product = self.apply_matrix(float64_array(x))
+        return matrix_vector_product if self.b is None else matrix_vector_product + self.b
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
         if is_traced(self.A):
@@ -440,19 +452,19 @@ class StateTimeEnergy(Energy):
         compensation = jnp.zeros_like(x) + compensation
         ends = jnp.stack([x + compensation, x + (compensation + d)])
 
-        def mean(states, times):
+        def mean_of_two_values(states, times):
             values = jax.vmap(lambda y, t: self.value(jnp.append(y, t)))(states, times)
             return 0.5 * (values[0] + values[1])
 
-        def mean_over_end_times(y):
-            return mean(jnp.stack([y, y]), ends[:, -1])
+        def average_over_end_times(y):
+            return mean_of_two_values(jnp.stack([y, y]), ends[:, -1])
 
-        def mean_over_end_states(t):
-            return mean(ends[:, :-1], jnp.concatenate([t, t]))
+        def average_over_end_states(t):
+            return mean_of_two_values(ends[:, :-1], jnp.concatenate([t, t]))
 
-        state_gradient = scheme.general(Function(mean_over_end_times), x[:-1], d[:-1], compensation[:-1])
+        state_gradient = scheme.general(Function(average_over_end_times), x[:-1], d[:-1], compensation[:-1])
         return jnp.concatenate(
-            [state_gradient, scheme.general(Function(mean_over_end_states), x[-1:], d[-1:], compensation[-1:])]
+            [state_gradient, scheme.general(Function(average_over_end_states), x[-1:], d[-1:], compensation[-1:])]
         )
 
     def stage_gradients(self, scheme, path) -> jax.Array:
@@ -530,7 +542,7 @@ class Pullback(Energy):
         return clique_pattern([np.asarray(self.coordinates.indices) % dim], dim)
 
     def check_components(self, dim: int, role: str) -> None:
-        check_coordinates(self.coordinates, dim, role)
+        check_coordinates_are_quadratic(self.coordinates, dim, role)
 
     depends_on_time = forward_to("term")
 

@@ -22,7 +22,7 @@ from ..errors import InputError
 from ..functions.bath_energy import BodyBathsEnergy
 from ..functions.checks import checked_energy, trace_energies, with_polynomial_degrees
 from ..functions.energy import Energy, make_energy
-from ..functions.on_spaces import energy_of_vectors, flatten_site_functions
+from ..functions.on_spaces import energy_of_vectors, functions_of_flat_states
 from ..tracing.short_form import format_arguments
 from ..tracing.traced import trace_callables
 from .baths import BathEntropy, HeatBaths, poisson_with_baths
@@ -118,9 +118,9 @@ class System(SystemInterface):
             return term.acts_on_baths_alone or (self.entropy is None and term.needs_entropy)
 
         terms = dissipation_terms(dissipation)
-        bath_terms = tuple(term for term in terms if drives_baths(term))
+        bath_energy_terms = tuple(term for term in terms if drives_baths(term))
         dissipation = sum_dissipations([term for term in terms if not drives_baths(term)] or None)
-        for term in bath_terms:
+        for term in bath_energy_terms:
             if baths is None and term.acts_on_baths_alone:
                 raise InputError(f"{type(term).__name__} acts on baths. Give the system baths=lt.HeatBaths(...)")
             if baths is None:
@@ -132,10 +132,10 @@ class System(SystemInterface):
                 )
         self.dissipation = None
         if dissipation is not None:
-            dissipation = flatten_site_functions(dissipation, self.shape)
+            dissipation = functions_of_flat_states(dissipation, self.shape)
             self.dissipation = _bind_dissipation(self, dissipation)
         if baths is not None:
-            _attach_baths(self, baths, bath_terms)
+            _attach_baths(self, baths, bath_energy_terms)
         if self.preserved and not is_traced(self):
             self.preserved_labels = find_preserved_names(self)
         if validate and not is_traced(self):
@@ -178,7 +178,7 @@ class System(SystemInterface):
 
     def energy_of_vectors(self, energy: Energy) -> Energy:
         """Return a function of flat states from a function of states in the shape that users see."""
-        return energy_of_vectors(flatten_site_functions(energy, self.shape), self.space)
+        return energy_of_vectors(functions_of_flat_states(energy, self.shape), self.space)
 
     def _trace_dissipation(self, dissipation: Dissipation) -> Dissipation:
         """Return the dissipation with its plain functions traced for the arguments that its force passes to them."""
@@ -333,14 +333,14 @@ def _bind_dissipation(system: System, dissipation: Dissipation) -> Dissipation:
     return system._trace_dissipation(dissipation.bind_to(system))
 
 
-def _attach_baths(system: System, baths: HeatBaths, bath_terms: tuple[Dissipation, ...]) -> None:
-    """Append baths to the system, in place; the dissipations ``bath_terms`` act on the extended states."""
+def _attach_baths(system: System, baths: HeatBaths, bath_energy_terms: tuple[Dissipation, ...]) -> None:
+    """Append baths to the system, in place; the dissipations ``bath_energy_terms`` act on the extended states."""
     body, n, m = copy(system), system.dim, baths.number
 
     def extend(energy: Energy) -> Energy:
         return energy.on(range(n))
 
-    if system.dissipation is not None or not bath_terms:
+    if system.dissipation is not None or not bath_energy_terms:
         system.dissipation = couple_to_baths(system.total_dissipation, body, m, baths.has_positive_temperatures, extend)
     if body.space is not None and body.space.dtype.kind == "c":
         raise InputError(f"baths are for real spaces, and {body.space.name} is complex")
@@ -351,8 +351,8 @@ def _attach_baths(system: System, baths: HeatBaths, bath_terms: tuple[Dissipatio
     heat = BathEntropy(m)
     system.entropy = heat if body.entropy is None else extend(body.entropy) + heat
     system.momentum_maps = {name: extend(J) for name, J in body.momentum_maps.items()}
-    if bath_terms:
-        bound_terms = tuple(_bind_dissipation(system, term) for term in bath_terms)
+    if bath_energy_terms:
+        bound_terms = tuple(_bind_dissipation(system, term) for term in bath_energy_terms)
         system.dissipation = sum_dissipations((*system.total_dissipation.terms, *bound_terms))
 
 

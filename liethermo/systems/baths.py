@@ -16,7 +16,13 @@ from manifolds._pytree_module import Module
 from manifolds.structures.poisson import ProductPoisson
 
 from ..errors import InputError
-from ..functions.bath_energy import BathEnergy, DrivenReservoirEnergy, ReservoirEnergy, bath_terms, make_bath_energy
+from ..functions.bath_energy import (
+    BathEnergy,
+    DrivenReservoirEnergy,
+    ReservoirEnergy,
+    bath_energy_terms,
+    make_bath_energy,
+)
 from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers
 from ..functions.energy import Energy, Sum
@@ -121,7 +127,8 @@ class HeatBaths(Module):
     def has_positive_temperatures(self) -> bool:
         """True if the temperatures are positive in every state by construction."""
         return all(
-            isinstance(term, BathEnergy | ReservoirEnergy | DrivenReservoirEnergy) for term in bath_terms(self.energy)
+            isinstance(term, BathEnergy | ReservoirEnergy | DrivenReservoirEnergy)
+            for term in bath_energy_terms(self.energy)
         )
 
     @property

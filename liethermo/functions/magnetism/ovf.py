@@ -154,6 +154,7 @@ def write_ovf(
 
 
 def _header_lines(array: np.ndarray, edges, base, version: int, title: str, unit: str) -> list[str]:
+    """Return the lines of the header of an OVF file, without the leading ``# ``."""
     nodes, dim = array.shape[:3], array.shape[3]
     first = "OOMMF OVF 2.0" if version == 2 else "OOMMF: rectangular mesh v1.0"
     lines = [first, "Segment count: 1", "Begin: Segment", "Begin: Header", f"Title: {title}"]
@@ -194,6 +195,7 @@ def _parse_header(content: bytes, name: str) -> tuple[int, dict[str, str], str, 
 
 
 def _version_of_line(line: str, name: str) -> int:
+    """Return the OVF version, 1 or 2, that the first line of a file names; raise FileError for another line."""
     text = line.lstrip("# ").lower()
     if text.startswith("oommf"):
         if text.endswith("2.0"):
@@ -204,6 +206,7 @@ def _version_of_line(line: str, name: str) -> int:
 
 
 def _read_data(content: bytes, start: int, kind: str, version: int, count: int, name: str) -> np.ndarray:
+    """Return ``count`` numbers from the data of an OVF file that begin at ``start``; raise FileError if damaged."""
     if kind == "text":
         end = content.find(b"#", start)
         words = content[start : end if end >= 0 else len(content)].split()

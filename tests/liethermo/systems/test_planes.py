@@ -13,7 +13,7 @@ from liethermo.engines import array_engine
 from liethermo.engines.solver_options import DEFAULT_OPTIONS
 from liethermo.engines.step import initial_run_state_program, reorder_components, take_step
 from liethermo.functions.gradients import DISCRETE_GRADIENTS, stage_gradients
-from liethermo.functions.on_spaces import to_component_order, to_site_order
+from liethermo.functions.on_spaces import spins_to_component_order, spins_to_site_order
 from liethermo.integrators.base import pullback_method
 from liethermo.integrators.tableaus import gauss_tableau, kronrod_rule
 from liethermo.systems.spins import reorder_spins
@@ -249,8 +249,8 @@ def test_what_has_no_other_order():
 
 def test_the_two_orders():
     x = np.arange(14.0)
-    assert to_component_order(x, 4).tolist() == [0, 3, 6, 9, 1, 4, 7, 10, 2, 5, 8, 11, 12, 13]
-    np.testing.assert_array_equal(to_site_order(to_component_order(np.stack([x, -x]), 4), 4), [x, -x])
+    assert spins_to_component_order(x, 4).tolist() == [0, 3, 6, 9, 1, 4, 7, 10, 2, 5, 8, 11, 12, 13]
+    np.testing.assert_array_equal(spins_to_site_order(spins_to_component_order(np.stack([x, -x]), 4), 4), [x, -x])
 
 
 def test_control_a_wrong_order_is_seen():
