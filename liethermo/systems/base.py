@@ -25,7 +25,7 @@ from ..functions.energy import Energy, make_energy
 from ..functions.on_spaces import energy_of_vectors, functions_of_flat_states
 from ..tracing.short_form import format_arguments
 from ..tracing.traced import trace_callables
-from .baths import BathEntropy, HeatBaths, poisson_with_baths
+from .baths import NO_BATHS, BathEntropy, HeatBaths, checked_baths, poisson_with_baths
 from .check import AXIOM_TOLERANCE, CheckReport, check_system, require_axioms
 from .conservation import project_covector
 from .interface import SystemInterface
@@ -65,9 +65,9 @@ class System(SystemInterface):
         state_space = body.space if body.lie_algebra is None else body.lie_algebra
         parts = {
             "energy": body.energy,
-            "entropy": None if self.baths is not None and isinstance(body.entropy, BathEntropy) else body.entropy,
+            "entropy": None if isinstance(body.entropy, BathEntropy) else body.entropy,
             "dissipation": self.dissipation,
-            "baths": self.baths,
+            "baths": self.baths if self.baths.number else None,
             "torque": self.torque_laws.name,
         }
         name = f"{self.dim} components" if state_space is None else state_space.name
@@ -91,8 +91,7 @@ class System(SystemInterface):
 
         Without ``check_poisson`` an expensive check is skipped, because Pi is a Poisson tensor by construction.
         """
-        if not isinstance(baths, HeatBaths | None):
-            raise InputError(f"baths must be lt.HeatBaths(...), got {type(baths).__name__}")
+        baths = checked_baths(baths)
         self.dim, self.space = dim, space
         self.poisson = trace_callables(poisson, lambda poisson, x: poisson.sharp(x, x), (dim,))
         self.energy = checked_energy(
@@ -118,13 +117,15 @@ class System(SystemInterface):
             return term.acts_on_baths_alone or (self.entropy is None and term.needs_entropy)
 
         terms = dissipation_terms(dissipation)
-        bath_energy_terms = tuple(term for term in terms if drives_baths(term))
+        bath_terms = tuple(term for term in terms if drives_baths(term))
         dissipation = sum_dissipations([term for term in terms if not drives_baths(term)] or None)
-        for term in bath_energy_terms:
-            if baths is None and term.acts_on_baths_alone:
-                raise InputError(f"{type(term).__name__} acts on baths. Give the system baths=lt.HeatBaths(...)")
-            if baths is None:
-                raise InputError(f"{type(term).__name__} drives the entropy up, so the system needs an entropy")
+        for term in bath_terms:
+            if not baths.number:
+                raise InputError(
+                    f"{type(term).__name__} acts on baths. Give the system baths=lt.HeatBaths(...)"
+                    if term.acts_on_baths_alone
+                    else f"{type(term).__name__} drives the entropy up, so the system needs an entropy"
+                )
             if not term.can_drive_baths:
                 raise InputError(
                     f"{type(term).__name__} drives the entropy of the body up, which it needs beside the entropies of "
@@ -134,15 +135,15 @@ class System(SystemInterface):
         if dissipation is not None:
             dissipation = functions_of_flat_states(dissipation, self.shape)
             self.dissipation = _bind_dissipation(self, dissipation)
-        if baths is not None:
-            _attach_baths(self, baths, bath_energy_terms)
+        if baths.number:
+            _attach_baths(self, baths, bath_terms)
         if self.preserved and not is_traced(self):
             self.preserved_labels = find_preserved_names(self)
         if validate and not is_traced(self):
             require_axioms(self, matrices=check_poisson)
 
     def drop_baths(self) -> System:
-        if self.baths is None:
+        if not self.baths.number:
             return self
         assert isinstance(self.poisson, ProductPoisson)
         return replace_fields(
@@ -151,7 +152,7 @@ class System(SystemInterface):
             space=None if self.space is None else _drop_last_factor(self.space),
             poisson=self.poisson.first,
             energy=self.energy.body if isinstance(self.energy, BodyBathsEnergy) else self.energy,
-            baths=None,
+            baths=NO_BATHS,
         )
 
     @with_library_settings
@@ -164,7 +165,7 @@ class System(SystemInterface):
         t : float or array, shape (...), optional
             The times of the states, if the temperatures depend on it.
         """
-        if self.baths is None:
+        if not self.baths.number:
             raise InputError("this system has no baths. Give it baths=lt.HeatBaths(...)")
         entropies, energy = jnp.asarray(x)[..., self.body_dim :], self.baths.energy
         if isinstance(self.energy, BodyBathsEnergy):  # which may be frozen at a time
@@ -333,14 +334,14 @@ def _bind_dissipation(system: System, dissipation: Dissipation) -> Dissipation:
     return system._trace_dissipation(dissipation.bind_to(system))
 
 
-def _attach_baths(system: System, baths: HeatBaths, bath_energy_terms: tuple[Dissipation, ...]) -> None:
-    """Append baths to the system, in place; the dissipations ``bath_energy_terms`` act on the extended states."""
+def _attach_baths(system: System, baths: HeatBaths, bath_terms: tuple[Dissipation, ...]) -> None:
+    """Append baths to the system, in place; the dissipations ``bath_terms`` act on the extended states."""
     body, n, m = copy(system), system.dim, baths.number
 
     def extend(energy: Energy) -> Energy:
         return energy.on(range(n))
 
-    if system.dissipation is not None or not bath_energy_terms:
+    if system.dissipation is not None or not bath_terms:
         system.dissipation = couple_to_baths(system.total_dissipation, body, m, baths.has_positive_temperatures, extend)
     if body.space is not None and body.space.dtype.kind == "c":
         raise InputError(f"baths are for real spaces, and {body.space.name} is complex")
@@ -351,8 +352,8 @@ def _attach_baths(system: System, baths: HeatBaths, bath_energy_terms: tuple[Dis
     heat = BathEntropy(m)
     system.entropy = heat if body.entropy is None else extend(body.entropy) + heat
     system.momentum_maps = {name: extend(J) for name, J in body.momentum_maps.items()}
-    if bath_energy_terms:
-        bound_terms = tuple(_bind_dissipation(system, term) for term in bath_energy_terms)
+    if bath_terms:
+        bound_terms = tuple(_bind_dissipation(system, term) for term in bath_terms)
         system.dissipation = sum_dissipations((*system.total_dissipation.terms, *bound_terms))
 
 
