@@ -66,7 +66,7 @@ class BathEnergy(Energy):
 
     @property
     def rate(self) -> jax.Array:
-        """Relative change of a temperature per entropy, 1 / C, shape (m,)."""
+        """Inverse heat capacities 1 / C, shape (m,): the relative change of a temperature per entropy."""
         return 1.0 / self.capacity
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array:

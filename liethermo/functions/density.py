@@ -210,7 +210,10 @@ def matrix_logarithm(rho) -> jax.Array:
 
 
 class DensityMatrixFunction(Module):
-    """A function of a density matrix, as a function of the state: coordinates of the matrix, then those of baths."""
+    """A function of the state of a quantum system that evaluates a function of its density matrix.
+
+    The state has the coordinates of the matrix first, then those of baths.
+    """
 
     function: Callable
     structure: mf.DensityMatrices
@@ -224,7 +227,7 @@ class DensityMatrixFunction(Module):
 
 
 class MeanEnergy(Linear):
-    """The mean energy ``tr(rho H)``, by the coordinates of rho, shape (N^2,), which has trace one, and those of H.
+    """The mean energy ``tr(rho H)`` as a function of the coordinates of rho, shape (N^2,), which has trace one.
 
     An energy e that the levels have in common is added as a constant: ``tr(rho (H - e)) + e``. The gradient then
     depends on differences of levels only, so a constant added to H changes neither the motion nor its rounding.
@@ -266,7 +269,7 @@ def subtract_level(hamiltonian_coordinates, level) -> jax.Array:
 
 
 class ExpectationValue(Module):
-    """The mean energy ``tr(rho H(t))``, by the coordinates of rho, for a Hamiltonian that is a function of time.
+    """The mean energy ``tr(rho H(t))`` as a function of the coordinates of rho and the time.
 
     The ``reference_level``, as in :class:`MeanEnergy`, is the lowest level at time zero, so it grows by c if H does: a
     discrete gradient weights the state and the time by the two gradients of the energy.
@@ -282,7 +285,7 @@ class ExpectationValue(Module):
 
 
 class ModulatedExpectationValue(Module):
-    """The mean energy ``tr(rho (H_0 + f_1(t) H_1 + ...))``, by the coordinates of rho and of the matrices H_i.
+    """The mean energy ``tr(rho (H_0 + f_1(t) H_1 + ...))`` as a function of the coordinates of rho and the time.
 
     The ``reference_level`` is chosen as in :class:`ExpectationValue`.
     """

@@ -53,22 +53,23 @@ def graph_edges(
     InputError
     """
     if isinstance(graph, jax.core.Tracer):  # a matrix that is swept or differentiated keeps all its edges
-        first, second = np.triu_indices(n_nodes, 1)
-        return Edges(first, second, graph if graph.ndim == 0 else graph[first, second])
-    first, second, weight = _node_and_weight_arrays(graph, n_nodes, weight_name)
+        first_nodes, second_nodes = np.triu_indices(n_nodes, 1)
+        return Edges(first_nodes, second_nodes, graph if graph.ndim == 0 else graph[first_nodes, second_nodes])
+    first_nodes, second_nodes, weight = _node_and_weight_arrays(graph, n_nodes, weight_name)
     if isinstance(weight, jax.Array):  # some weights are tracers
-        return Edges(first, second, weight)
-    for e in np.flatnonzero((first == second) & (weight != 0.0))[:1]:
+        return Edges(first_nodes, second_nodes, weight)
+    for e in np.flatnonzero((first_nodes == second_nodes) & (weight != 0.0))[:1]:
         raise InputError(
-            f"{weight_name} of {node_names[first[e]]} with itself must be 0, got {weight[e]:g}. Leave the diagonal zero"
+            f"{weight_name} of {node_names[first_nodes[e]]} with itself must be 0, got {weight[e]:g}. "
+            "Leave the diagonal zero"
         )
     for e in np.flatnonzero(~((allow_negative | (weight >= 0.0)) & np.isfinite(weight)))[:1]:
-        ends = f"{node_names[first[e]]} and {node_names[second[e]]}"
+        ends = f"{node_names[first_nodes[e]]} and {node_names[second_nodes[e]]}"
         raise InputError(
             f"{weight_name} between {ends} must be finite{'' if allow_negative else ' and >= 0'}, got {weight[e]:g}"
         )
     is_nonzero = weight != 0.0
-    return Edges(first[is_nonzero], second[is_nonzero], jnp.asarray(weight[is_nonzero]))
+    return Edges(first_nodes[is_nonzero], second_nodes[is_nonzero], jnp.asarray(weight[is_nonzero]))
 
 
 def connected_component_labels(graph: Edges, n_nodes: int) -> np.ndarray:
@@ -92,9 +93,9 @@ def _node_and_weight_arrays(
     weight_by_pair: dict[tuple[int, int], Any] = {}
     for edge in graph:
         try:
-            first, second, k = edge
-            i, j, k = int(first), int(second), k if isinstance(k, jax.core.Tracer) else float(k)
-            if (i, j) != (first, second):
+            first_node, second_node, k = edge
+            i, j, k = int(first_node), int(second_node), k if isinstance(k, jax.core.Tracer) else float(k)
+            if (i, j) != (first_node, second_node):
                 raise TypeError("not whole numbers")
         except (TypeError, ValueError):
             raise InputError(f"{weight_name}: an edge must be (i, j, weight), got {edge!r}") from None

@@ -145,7 +145,7 @@ class Energy(Module):
         return scheme(self, path)
 
     def pullback_to_chart(self, coordinates: mf.Coordinates, space: mf.Space, start=None) -> Energy:
-        """Return a function of state vectors of a space as a function of coordinates.
+        """Return this energy of state vectors of a space as an energy of the coordinates of a chart.
 
         For a single step, ``start`` is the state vector at which the step begins.
         """
@@ -177,7 +177,7 @@ class Energy(Module):
 
     def map_terms(self, transform: Callable[[Energy], Energy]) -> Energy:
         """Return the sum of ``transform(term)``, an energy, over the terms."""
-        return Sum.of([transform(term) for term in self.terms])
+        return Sum.from_terms([transform(term) for term in self.terms])
 
     @property
     def depends_on_time(self) -> bool:
@@ -189,7 +189,7 @@ class Energy(Module):
         return self
 
     def with_time(self) -> Energy:
-        """Return a time-dependent energy as one of the state with the time appended, shape (n + 1,)."""
+        """Return a time-dependent energy as an energy of the state with the time appended, shape (n + 1,)."""
         raise NotImplementedError(f"{type(self).__name__} does not depend on time")
 
     @with_library_settings
@@ -410,7 +410,7 @@ class TimeDependent(Energy, FunctionWithBreaks):
 
 
 class SpanLimitedEnergy(Energy):
-    """A function of a state with the time appended, shape (n + 1,), whose time is clipped to a span."""
+    """An energy of a state with the time appended, shape (n + 1,), whose time is clipped to a span."""
 
     energy: Energy
     span: TimeSpan
@@ -472,7 +472,11 @@ class StateTimeEnergy(Energy):
 
 
 def _squared_gradient_weights(gradients) -> jax.Array:
-    """Return weights of components, shape (m,): the squared gradient by state for each, then that by time."""
+    """Return weights, shape (m,), of the components of a correction: those of the state, then that of the time.
+
+    The weight of each component of the state is the squared norm of the gradient by the state, and the weight of the
+    time is the squared derivative by the time; ``gradients``, shape (s, m), are those at the stages.
+    """
     scale = jnp.max(jnp.abs(gradients))
     squares = jnp.sum((gradients / jnp.where(scale > 0.0, scale, 1.0)) ** 2, axis=0)
     return jnp.append(jnp.full(gradients.shape[1] - 1, jnp.sum(squares[:-1])), squares[-1])
@@ -489,7 +493,10 @@ class Pullback(Energy):
     coordinates: Callable
 
     def __init__(self, term: Energy, coordinates: Sequence[int] | np.ndarray | Callable):
-        self.term, self.coordinates = term, coordinates if callable(coordinates) else Components.of(coordinates)
+        self.term, self.coordinates = (
+            term,
+            coordinates if callable(coordinates) else Components.from_indices(coordinates),
+        )
 
     @property
     def _selects_components(self) -> bool:
@@ -624,7 +631,7 @@ class Sum(Energy):
     summands: tuple[Energy, ...]
 
     @classmethod
-    def of(cls, terms: Sequence[Energy]) -> Energy:
+    def from_terms(cls, terms: Sequence[Energy]) -> Energy:
         """Return the sum of some terms; a single term is returned as it is."""
         return terms[0] if len(terms) == 1 else cls(tuple(terms))
 
@@ -672,7 +679,7 @@ def make_energy(function, role: str) -> Energy:
     if isinstance(function, Energy):
         return function
     if isinstance(function, list) and function and all(isinstance(term, Energy) for term in function):
-        return Sum(tuple(part for term in function for part in term.terms))
+        return Sum(tuple(summand for term in function for summand in term.terms))
     if isinstance(function, mf.Polynomial) and function.degree <= 2:
         return quadratic_from_polynomial(function)
     if callable(function):
@@ -685,7 +692,7 @@ CHART_ROUNDINGS = 4.0
 
 
 class ChartEnergy(Energy):
-    """A function of state vectors, as a function of the coordinates of a chart."""
+    """An energy of the state vectors of a space, evaluated on the coordinates of a chart."""
 
     energy: Energy
     coordinates: mf.Coordinates

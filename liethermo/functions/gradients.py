@@ -239,7 +239,7 @@ MAX_NOISE_CORRECTION = 1e-10
 """Largest correction that consists of rounding noise, relative to the gradient."""
 
 
-def stage_gradients(
+def discrete_gradients_at_stages(
     energy: Energy, x, compensation, h, k, A, b, kronrod: KronrodRule | None = None, symmetries: jax.Array | None = None
 ) -> jax.Array:
     """Return discrete gradients at the stages of a collocation method, shape (s, n) [:doc:`/explanation/exact_laws`].
@@ -277,7 +277,7 @@ def _corrected_stage_gradients(term: Energy, path: CollocationPath, correction_w
     if term.is_quadratic:
         return jax.vmap(term.gradient)(path.points)
     x, compensation, k, h, b = path.start, path.compensation, path.slopes, path.h, path.b
-    change = FunctionChange.of(
+    change = FunctionChange.over_step(
         term,
         x,
         compensation,
@@ -300,7 +300,7 @@ def _corrected_stage_gradients(term: Energy, path: CollocationPath, correction_w
         change,
         gradients,
         k,
-        CorrectionDirection.of(k, b, weights, path.symmetries),
+        CorrectionDirection.from_slopes(k, b, weights, path.symmetries),
         h,
         b,
         quadrature_correction,
@@ -326,7 +326,7 @@ class CorrectionDirection(NamedTuple):
     length_fraction: jax.Array
 
     @classmethod
-    def of(cls, k, b, weights=None, symmetries=None) -> CorrectionDirection:
+    def from_slopes(cls, k, b, weights=None, symmetries=None) -> CorrectionDirection:
         """Return the direction ``d = W k``, W diagonal, without components along the symmetries, shape (s, r, m)."""
         scale = jnp.ones(()) if weights is None else sqrt_or_zero(weights)
         weighted_slopes = projection = scale * k
@@ -354,15 +354,15 @@ class FunctionChange(NamedTuple):
     gradients: jax.Array
 
     @classmethod
-    def of(cls, term: Energy, x, compensation, d, points: list[jax.Array]) -> FunctionChange:
+    def over_step(cls, term: Energy, x, compensation, d, points: list[jax.Array]) -> FunctionChange:
         """Return the change of a term from x + compensation to x + compensation + d."""
-        new, new_compensation = two_sum(x, compensation + d)
+        new_x, new_compensation = two_sum(x, compensation + d)
         # one vmap for all points, so that the gradient is compiled once
-        point_gradients = jax.vmap(term.gradient)(jnp.concatenate([*points, jnp.stack([x, new])]))
+        point_gradients = jax.vmap(term.gradient)(jnp.concatenate([*points, jnp.stack([x, new_x])]))
         gradients, end_gradients = point_gradients[:-2], point_gradients[-2:]
         # these matter only for rounding; an infinite one, as of a root at its end, is ignored
         end_gradients = jnp.where(jnp.isfinite(end_gradients), end_gradients, 0.0)
-        start_value, end_value = _values_at_points(term, jnp.stack([x, new]))
+        start_value, end_value = _values_at_points(term, jnp.stack([x, new_x]))
         # of the compensated states: otherwise a step would undo what rounding or a correction of the energy has changed
         difference = (end_value - start_value) + (
             jnp.dot(end_gradients[1], new_compensation) - jnp.dot(end_gradients[0], compensation)
@@ -429,8 +429,8 @@ def _value_difference_and_rounding_scale(term: Energy, x, d, compensation, gradi
     evaluated in between, adds the effect of the compensation. Otherwise a step would undo what rounding, or a
     correction of the energy, has changed.
     """
-    new, new_compensation = two_sum(x, compensation + d)
-    start_value, end_value = _values_at_points(term, jnp.stack([x, new]))
+    new_x, new_compensation = two_sum(x, compensation + d)
+    start_value, end_value = _values_at_points(term, jnp.stack([x, new_x]))
     difference = (end_value - start_value) + jnp.dot(gradient, new_compensation - compensation)
     return difference, _value_rounding_scale(start_value, end_value, term.rounding_scale(x))
 

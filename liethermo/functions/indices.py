@@ -116,11 +116,11 @@ class Components(ComponentMap):
     indices: range | Indices = eqx.field(static=True)
 
     @classmethod
-    def of(cls, numbers: Sequence[int] | np.ndarray) -> Components:
+    def from_indices(cls, indices: Sequence[int] | np.ndarray) -> Components:
         """Return the components with these indices."""
-        if isinstance(numbers, range) and numbers.step == 1 and numbers.start >= 0:
-            return cls(numbers)
-        return cls(Indices(np.asarray(numbers, dtype=np.int64)))
+        if isinstance(indices, range) and indices.step == 1 and indices.start >= 0:
+            return cls(indices)
+        return cls(Indices(np.asarray(indices, dtype=np.int64)))
 
     def __call__(self, x):
         indices = self.indices

@@ -43,9 +43,9 @@ def newton_iterate(function: Callable, start, n_steps: int, jacobian_and_value: 
     return jax.lax.fori_loop(0, n_steps, lambda _, y: y - newton_correction(*jacobian_and_value(function, y)), start)
 
 
-def nan_unless_small(y, residual, bound) -> jax.Array:
+def nan_unless_small(y, residual, max_residual) -> jax.Array:
     """Return y, or NaN if an entry of the residual exceeds the bound."""
-    return jnp.where(jnp.max(jnp.abs(residual)) <= bound, y, jnp.nan)
+    return jnp.where(jnp.max(jnp.abs(residual)) <= max_residual, y, jnp.nan)
 
 
 @eqx.filter_custom_jvp

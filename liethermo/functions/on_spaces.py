@@ -220,7 +220,7 @@ def energy_in_component_order(energy: Energy, n_spins: int) -> Energy:
             terms.append(_term_in_component_order(term, n_spins))
     if spin_energies:
         terms.append(PlanarSpinEnergy(tuple(spin_energies)))
-    return Sum.of(terms)
+    return Sum.from_terms(terms)
 
 
 def _term_in_component_order(term: Energy, n_spins: int) -> Energy:

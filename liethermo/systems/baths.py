@@ -122,7 +122,7 @@ class HeatBaths(Module):
         constant = np.array([i for i, f in enumerate(functions) if f is None and i not in driven], dtype=int)
         if constant.size:
             terms.append(make_bath_energy(C[constant], T[constant]).on(constant))
-        self.energy = Sum.of(terms)
+        self.energy = Sum.from_terms(terms)
 
     @property
     def has_positive_temperatures(self) -> bool:

@@ -26,7 +26,7 @@ Guard: TypeAlias = tuple[tuple[str, bool], ...]
 
 
 class Branch(NamedTuple):
-    """A choice between two sides.
+    """A branch of a program: its condition, the instructions of both sides, and the selections between them.
 
     Attributes
     ----------

@@ -252,7 +252,7 @@ def replace_constants_by_strided_inputs(
 
 
 class Builder:
-    """Collects instructions; each method returns the scalar that holds its result.
+    """Builds a scalar program: each method emits instructions and returns the scalar that holds their result.
 
     No instruction is emitted for a result that is known at compile time, that equals an earlier one, or that differs
     from one by a sign which a later instruction can absorb. These simplifications are exact, except for the sign of a
@@ -456,7 +456,10 @@ class Builder:
         return self.pick_prepared(index, self.prepare_pick(entries))
 
     def prepare_pick(self, entries: Sequence[Scalar]) -> tuple[Scalar, ...]:
-        """Return the one entry that all entries equal, a few entries, or :data:`TABLE_MARK` and the name of a table."""
+        """Prepare entries for :meth:`pick_prepared`, so that many picks share one table.
+
+        Return one entry if all are equal, the entries if they are few, or :data:`TABLE_MARK` and the name of a table.
+        """
         if all(type(a) is type(entries[0]) and repr(a) == repr(entries[0]) for a in entries):
             return (entries[0],)
         return tuple(entries) if len(entries) <= MAX_SELECT_ENTRIES else (TABLE_MARK, self.make_table(entries))

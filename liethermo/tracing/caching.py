@@ -101,7 +101,7 @@ def memoize(function: Callable[..., Result]) -> Callable[..., Result]:
 
 
 class _Content(NamedTuple):
-    """Content of an argument of a cached function.
+    """Key and size of an argument of a cached function, for a lookup by its content.
 
     Attributes
     ----------

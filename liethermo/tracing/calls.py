@@ -16,8 +16,9 @@ from .builder import Block
 
 @dataclass(frozen=True, eq=False)
 class LapackCall(Block):
-    """A function of matrices, passed row by row; complex ones pass all real parts, then all imaginary parts.
+    """A block that calls a LAPACK function of matrices.
 
+    Matrices are passed row by row; complex ones pass all real parts, then all imaginary parts.
     The results are NaN if an argument is not finite or the function does not converge.
 
     Attributes
@@ -82,7 +83,7 @@ class LapackCall(Block):
 
 @dataclass(frozen=True, eq=False)
 class MatrixProduct(Block):
-    """The product of two real matrices, as a loop; its arguments are two tables.
+    """A block that multiplies two real matrices in a loop; its arguments are two tables.
 
     Attributes
     ----------
@@ -114,7 +115,7 @@ class MatrixProduct(Block):
 
 @dataclass(frozen=True, eq=False)
 class DeferredBlock(Block):
-    """A block that the writer of the code fills in; evaluated as it stands, it returns its first arguments.
+    """A placeholder block that the writer of machine code fills in; evaluated by NumPy, it returns its first arguments.
 
     Attributes
     ----------
@@ -137,7 +138,7 @@ deferred_p.def_abstract_eval(lambda *avals, results: list(avals[:results]))
 
 @dataclass(frozen=True)
 class LapackFunction:
-    """Shapes and implementation of a function that :class:`LapackCall` calls.
+    """Argument shapes, result shapes and implementation of a function that :class:`LapackCall` calls.
 
     Attributes
     ----------
@@ -152,18 +153,21 @@ class LapackFunction:
 
 
 def _lu_factors_and_pivots(sizes, matrix) -> tuple[np.ndarray, np.ndarray]:
+    """Return both LU factors in one matrix, and the row with which each row is exchanged."""
     (getrf,) = scipy.linalg.get_lapack_funcs(("getrf",), (matrix,))
     factors, pivots, _ = getrf(matrix)
     return factors, pivots.astype(np.float64)
 
 
 def _qr_factors(sizes, matrix) -> tuple[np.ndarray, np.ndarray]:
+    """Return the factors Q and R, with as many columns of Q as ``sizes`` asks for."""
     columns = sizes[2]
     q, r = scipy.linalg.qr(matrix, mode="full" if columns == sizes[0] else "economic")
     return q, r[: sizes[0] if columns == sizes[0] else columns]
 
 
 def _singular_values_and_vectors(sizes, matrix) -> tuple[np.ndarray, ...]:
+    """Return singular values, left singular vectors as columns, and right ones as rows."""
     u, s, v = scipy.linalg.svd(matrix, full_matrices=bool(sizes[2]), lapack_driver="gesdd")
     return s, u, v
 

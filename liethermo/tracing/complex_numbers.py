@@ -185,7 +185,7 @@ class ComplexBuilder:
         )
 
     def _minus_i_f_of_i_a(self, function, a):
-        """Return ``-i f(i a)``."""
+        """Return ``-i f(i a)`` of a complex number, which gives sinh from sin, and tan from tanh."""
         result = function(ComplexPair(self.real_builder.neg(a.im), a.re))
         return ComplexPair(result.im, self.real_builder.neg(result.re))
 

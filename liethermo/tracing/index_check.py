@@ -102,7 +102,7 @@ def _check_and_evaluate_indices(
         if name in INDEX_ACCESSES:
             for index, axis_length in _invalid_indices(eqn, values, caller or eqn):
                 error = IndexOutOfRangeError(
-                    index, axis_length, user_source_line(caller or eqn), access=_kind_of_access(eqn)
+                    index, axis_length, user_source_line(caller or eqn), access=_access_kind(eqn)
                 )
                 if name != "gather" or eqn.invars[1].aval.size == eqn.invars[1].aval.shape[-1]:
                     raise error
@@ -143,7 +143,7 @@ def _calls_function_of_jax(eqn) -> bool:
     return filename is not None and not is_user_file(Path(filename))
 
 
-def _kind_of_access(eqn) -> str:
+def _access_kind(eqn) -> str:
     """Return "read" or "write" for an access that moves an index out of range, "fill" or "drop" if it skips it."""
     reads = eqn.primitive.name in ("gather", "dynamic_slice")
     if eqn.params.get("mode") == ScatterMode.FILL_OR_DROP:
@@ -201,7 +201,7 @@ def _evaluate_with_fill_value(jaxpr: Jaxpr, consts: Sequence, arguments: Sequenc
             params = eqn.params
             if (
                 name == "gather"
-                and (is_silently_clamped(eqn) or _reads_nan(eqn))
+                and (is_silently_clamped(eqn) or _gather_fills_with_nan(eqn))
                 and jnp.issubdtype(eqn.invars[0].aval.dtype, jnp.inexact)
             ):
                 params = params | {"mode": ScatterMode.FILL_OR_DROP, "fill_value": fill_value}
@@ -222,7 +222,7 @@ def _invalid_indices(eqn, constant_inputs: Sequence, call: Any) -> Iterator[tupl
 
     ``call`` is the equation whose traceback has the user's call.
     """
-    if eqn.params.get("mode") == ScatterMode.FILL_OR_DROP and not _omits_mode(call):
+    if eqn.params.get("mode") == ScatterMode.FILL_OR_DROP and not _user_call_omits_mode(call):
         return
     for axis, starts, window in INDEX_ACCESSES[eqn.primitive.name](eqn, constant_inputs):
         axis_length = eqn.invars[0].aval.shape[axis]
@@ -258,13 +258,13 @@ def is_silently_clamped(eqn) -> bool:
     return mode == ScatterMode.PROMISE_IN_BOUNDS or (mode == ScatterMode.CLIP and not dropped_axes)
 
 
-def _reads_nan(eqn) -> bool:
+def _gather_fills_with_nan(eqn) -> bool:
     """Return whether a gather reads NaN at an index out of range."""
     fill_value = eqn.params.get("fill_value")
     return eqn.params["mode"] == ScatterMode.FILL_OR_DROP and (fill_value is None or bool(np.isnan(fill_value)))
 
 
-def _omits_mode(eqn) -> bool:
+def _user_call_omits_mode(eqn) -> bool:
     """Return whether the user's call of a function with an argument ``mode`` leaves this argument out.
 
     In a jaxpr, ``x.at[3].set(0.0)`` and ``x.at[3].set(0.0, mode="drop")`` are the same, so the names of the arguments
@@ -276,7 +276,7 @@ def _omits_mode(eqn) -> bool:
     called_function = eqn.params.get("name")  # of a function that is jitted: no frame of its own is on the stack
     for code, offset in zip(*traceback.raw_frames(), strict=True):
         if is_user_file(Path(code.co_filename)):
-            keywords = _keywords_of_call(code, offset)
+            keywords = _keyword_names_of_call(code, offset)
             return called_function in MODE_ARGUMENT_FUNCTIONS and keywords is not None and "mode" not in keywords
         if not set(Path(code.co_filename).parts) & _JAX_MACHINERY:
             called_function = code.co_name
@@ -287,7 +287,7 @@ _JAX_MACHINERY = {"interpreters", "core.py", "source_info_util.py", "pjit.py", "
 """Files and folders of JAX whose functions stand between a public function and the operations that it traces."""
 
 
-def _keywords_of_call(code: CodeType, offset: int) -> tuple[str, ...] | None:
+def _keyword_names_of_call(code: CodeType, bytecode_offset: int) -> tuple[str, ...] | None:
     """Return the names of the keyword arguments of the call at an offset of the bytecode; None for ``**options``.
 
     The offset may lie behind that of the call, in the space that Python reserves for its cache.
@@ -296,7 +296,7 @@ def _keywords_of_call(code: CodeType, offset: int) -> tuple[str, ...] | None:
     last_constant: Any = ()
     call, keywords_of_call = "", keywords
     for instruction in dis.get_instructions(code):
-        if instruction.offset > offset:
+        if instruction.offset > bytecode_offset:
             break
         call, keywords_of_call = instruction.opname, keywords
         if call == "LOAD_CONST":
@@ -312,7 +312,7 @@ def _keywords_of_call(code: CodeType, offset: int) -> tuple[str, ...] | None:
 
 def _gather_accesses(eqn, constant_inputs):
     """Yield (axis, starts of windows, length of window) for each indexed axis of a gather with constant indices."""
-    if is_silently_clamped(eqn) or _reads_nan(eqn):
+    if is_silently_clamped(eqn) or _gather_fills_with_nan(eqn):
         yield from _accesses_by_axis(
             constant_inputs[1], eqn.params["dimension_numbers"].start_index_map, eqn.params["slice_sizes"]
         )

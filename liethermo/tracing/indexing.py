@@ -24,6 +24,7 @@ def _flat_window_index_and_candidates(
 
 
 def _flat_window_index(builder, shape: Index, starts: Sequence[Scalar], sizes: Index) -> Scalar:
+    """Return the index of a window among :func:`_candidate_windows`, a scalar that may be known at run time only."""
     window_number: Scalar = 0
     for s, n, m in zip(starts, shape, sizes, strict=True):
         if type(s) is str:
@@ -32,6 +33,7 @@ def _flat_window_index(builder, shape: Index, starts: Sequence[Scalar], sizes: I
 
 
 def _candidate_windows(shape: Index, starts: Sequence[Scalar], sizes: Index) -> list[tuple]:
+    """Return every window, a tuple of slices, that the starts may select; a start that is a number fixes its axis."""
     ranges = []
     for s, n, m in zip(starts, shape, sizes, strict=True):
         fixed_start = None if type(s) is str else min(max(int(s), 0), n - m)
@@ -43,19 +45,19 @@ def _candidate_windows(shape: Index, starts: Sequence[Scalar], sizes: Index) -> 
 
 def _is_window_inside(builder, shape: Index, starts: Sequence[Scalar], sizes: Index) -> Scalar:
     """Return the scalar that is true if a window lies inside an array of this shape."""
-    bounds = list(zip(starts, (n - m for n, m in zip(shape, sizes, strict=True)), strict=True))
-    if not all(0 <= s <= last_start for s, last_start in bounds if not isinstance(s, str)):
+    start_bounds = list(zip(starts, (n - m for n, m in zip(shape, sizes, strict=True)), strict=True))
+    if not all(0 <= s <= last_start for s, last_start in start_bounds if not isinstance(s, str)):
         return False
     return builder.all(
         builder.op(test, s, bound)
-        for s, last_start in bounds
+        for s, last_start in start_bounds
         if type(s) is str
         for test, bound in (("ge", 0), ("le", last_start))
     )
 
 
 def read_window(builder, x: np.ndarray, starts: Sequence[Scalar], sizes: Index) -> np.ndarray:
-    """Return the entries in a window, shape ``sizes`` (``dynamic_slice``)."""
+    """Unroll ``dynamic_slice``: return the entries of x in the window with these starts, shape ``sizes``."""
     if builder is builder.real_builder and any(type(s) is str for s in starts):
         return _read_window_by_shared_tables(builder, x, starts, sizes)
     window_number, windows = _flat_window_index_and_candidates(builder.real_builder, x.shape, starts, sizes)
@@ -83,7 +85,7 @@ def _read_window_by_shared_tables(builder, x: np.ndarray, starts: Sequence[Scala
 def update_window_in_place(
     builder, x: np.ndarray, starts: Sequence[Scalar], sizes: Index, change: Callable, condition: Scalar = True
 ) -> None:
-    """Change the entries in a window to ``change(old)`` where the condition holds."""
+    """Replace the entries of x in the window with these starts by ``change(entries)`` where the condition holds."""
     window_number, windows = _flat_window_index_and_candidates(builder.real_builder, x.shape, starts, sizes)
     for i, window in enumerate(windows):
         is_hit = (
@@ -95,6 +97,7 @@ def update_window_in_place(
 
 
 def _select_array(builder, test: Scalar, x: np.ndarray, fallback) -> np.ndarray:
+    """Return ``x if test else fallback`` as an array of scalars."""
     return x if test is True else map_elementwise(lambda a, c: builder.select(test, a, c), x, fallback)
 
 

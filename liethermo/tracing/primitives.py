@@ -123,7 +123,7 @@ def _select(builder, eqn, selector, *cases):
     return result
 
 
-def _convert(builder, eqn, x):
+def _convert_element_type(builder, eqn, x):
     return convert_dtype(builder, x, _input_dtype(eqn), np.dtype(eqn.params["new_dtype"]))
 
 
@@ -337,7 +337,7 @@ def _unstack(x, params):
     return [section.squeeze(axis) for section in np.split(x, x.shape[axis], axis)]  # arrays, even 0-d ones
 
 
-def _split_sections(x, params):
+def _split(x, params):
     return np.split(x, np.cumsum([int(n) for n in params["sizes"]])[:-1], axis=params["axis"])
 
 
@@ -351,10 +351,12 @@ def _gather(builder, eqn, x, indices):
 
 
 def _scatter_rule(combine: Callable[..., Scalar]) -> Rule:
-    """Return the unrolling rule of a scatter that replaces an entry by ``combine(builder, old, update)``."""
+    """Return the unrolling rule of a scatter that replaces an entry by ``combine(builder, old_entry, update)``."""
 
     def rule(builder, eqn, x, indices, updates):
-        return indexing.scatter(builder, eqn, x, indices, updates, lambda old, new: combine(builder, old, new))
+        return indexing.scatter(
+            builder, eqn, x, indices, updates, lambda old_entry, update: combine(builder, old_entry, update)
+        )
 
     return rule
 
@@ -375,7 +377,7 @@ UNROLLING_RULES: dict[str, Rule] = {
     **{name: _operation_rule(name) for name in ELEMENTARY_OPERATIONS},
     "not": _not,
     "select_n": _select,
-    "convert_element_type": _convert,
+    "convert_element_type": _convert_element_type,
     **dict.fromkeys(("stop_gradient", "copy", "copy_p", "name", "optimization_barrier"), _identity),
     "reduce_sum": _reduction_rule(_make_method_combiner("add"), 0),
     "reduce_prod": _reduction_rule(_make_method_combiner("mul"), 1),
@@ -396,7 +398,7 @@ UNROLLING_RULES: dict[str, Rule] = {
     "transpose": _rearrangement_rule(lambda x, params: x.transpose(params["permutation"])),
     "rev": _rearrangement_rule(lambda x, params: np.flip(x, params["dimensions"]) if params["dimensions"] else x),
     "slice": _rearrangement_rule(_slice),
-    "split": _rearrangement_rule(_split_sections),
+    "split": _rearrangement_rule(_split),
     "concatenate": lambda builder, eqn, *xs: np.concatenate(xs, axis=eqn.params["dimension"]),
     "stack": lambda builder, eqn, *xs: np.stack(xs, axis=eqn.params["axis"]),
     "unstack": _rearrangement_rule(_unstack),

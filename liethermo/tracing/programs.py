@@ -234,33 +234,33 @@ def _compile_or_load(function: Callable, arguments: tuple, options: dict | None)
     """
     devices = jax.devices()
     is_cpu = devices[0].platform == "cpu"
-    jitted = jax.jit(function, compiler_options=options if is_cpu else None)
+    jitted_function = jax.jit(function, compiler_options=options if is_cpu else None)
     if len(devices) > 1 or not is_cpu or getattr(jax.config, "jax_compilation_cache_dir"):  # noqa: B009
-        return jitted
-    lowered = jitted.lower(arguments)
-    text = lowered.as_text()
+        return jitted_function
+    lowered_program = jitted_function.lower(arguments)
+    text = lowered_program.as_text()
     if "callback" in text:
-        return lowered.compile()
+        return lowered_program.compile()
     name = hashlib.sha256(f"{_compiler_identity()} {options}\n{text}".encode()).hexdigest()[:32]
-    if (program := _load_stored_program(name, lowered)) is not None:
+    if (program := _load_stored_program(name, lowered_program)) is not None:
         return program
     start = time.perf_counter()
-    compiled = lowered.compile()
+    compiled_program = lowered_program.compile()
     if time.perf_counter() - start >= MIN_STORED_COMPILE_SECONDS:
-        write_machine_code(name, zlib.compress(serialize_executable.serialize(compiled)[0], 1), XLA_SUFFIX)
-    return compiled
+        write_machine_code(name, zlib.compress(serialize_executable.serialize(compiled_program)[0], 1), XLA_SUFFIX)
+    return compiled_program
 
 
 XLA_SUFFIX = ".xla"
 """Suffix of the files of programs that XLA compiled."""
 
 
-def _load_stored_program(name: str, lowered: Any) -> Callable | None:
+def _load_stored_program(name: str, lowered_program: Any) -> Callable | None:
     """Load the compiled program that was written to disk under ``name``; None if there is none that can be loaded."""
     code = read_machine_code(name, XLA_SUFFIX)
     if code is None:
         return None
-    trees = lowered.in_tree, lowered.out_tree
+    trees = lowered_program.in_tree, lowered_program.out_tree
     try:
         return serialize_executable.deserialize_and_load(zlib.decompress(code), *trees)
     except Exception:  # of any kind, from XLA's and JAX's insides: the program is compiled again

@@ -61,7 +61,7 @@ class UnsupportedPrimitive(LiethermoError):
 
 
 class CompilerFault(UnsupportedPrimitive):
-    """An unexpected exception inside the compiled engine: a fault of this library.
+    """Error that an unexpected exception occurred inside the compiled engine: a fault of this library.
 
     It replaces the exception, so that the array engine can take over.
 
@@ -255,7 +255,7 @@ WRAPPING_PRIMITIVES = frozenset(
 
 
 def _unroll_call_equation(builder, eqn, *arguments):
-    """Unroll a call; calls of one jaxpr with equal arguments are unrolled once."""
+    """Unroll an equation that calls a jaxpr; calls of one jaxpr with equal arguments are unrolled once."""
     inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
     jaxpr = inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner
     entries = tuple(a if type(a) is str else repr(a) for a in flatten_scalars(arguments))
@@ -563,10 +563,12 @@ def _unroll_scatter(builder, eqn, x, indices, updates):
     entry_builder = ComplexBuilder(builder) if eqn.invars[0].aval.dtype.kind == "c" else builder
     jaxpr, consts = eqn.params["update_jaxpr"], eqn.params["update_consts"]
     if jaxpr is None:
-        return indexing.scatter(entry_builder, eqn, x, indices, updates, lambda old, new: new)
+        return indexing.scatter(entry_builder, eqn, x, indices, updates, lambda old_entry, update: update)
 
-    def combine(old, new):
-        return _unroll_jaxpr(builder, jaxpr, consts, [scalar_array([old], ()), scalar_array([new], ())])[0].item()
+    def combine(old_entry, update):
+        return _unroll_jaxpr(builder, jaxpr, consts, [scalar_array([old_entry], ()), scalar_array([update], ())])[
+            0
+        ].item()
 
     return indexing.scatter(entry_builder, eqn, x, indices, updates, combine)
 

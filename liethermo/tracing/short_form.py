@@ -79,7 +79,7 @@ def _format_object(value: eqx.Module, depth: int) -> str:
     shown_fields = [field.name for field in dataclasses.fields(value) if field.repr and field.name in vars(value)]
     fields = {name: vars(value)[name] for name in shown_fields}
     for name in SUM_FIELDS & fields.keys():
-        return join_first_items((short_form(part, depth + 1) for part in fields[name]), ("", ""), " + ")
+        return join_first_items((short_form(summand, depth + 1) for summand in fields[name]), ("", ""), " + ")
     for name in WRAPPED_FIELDS & fields.keys():
         return short_form(fields[name], depth)
     if depth >= MAX_DEPTH:

@@ -45,7 +45,7 @@ class TaylorSeriesError(InputError):
         return type(self)(self.primitive, self.source_line, subject, f": {advice}")
 
 
-def check_taylor_series(function: Callable, x) -> None:
+def check_has_taylor_series(function: Callable, x) -> None:
     """Raise TaylorSeriesError unless a function of an array like x has a Taylor series; compute no coefficients."""
     jax.eval_shape(lambda x: _Recurrences(function, x).evaluation_order and (), jnp.zeros_like(x))
 

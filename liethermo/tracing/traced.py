@@ -212,7 +212,7 @@ def is_library_object(function: Any) -> bool:
     return _defining_module(function).split(".")[0] in ("liethermo", "manifolds")
 
 
-def _check_indices_of(tree: Any, example_use: Callable, shapes: Sequence[tuple[int, ...]]) -> None:
+def _check_indices_in_use(tree: Any, example_use: Callable, shapes: Sequence[tuple[int, ...]]) -> None:
     """Raise IndexOutOfRangeError if a user's object has a constant index out of range; skip what cannot be traced."""
     try:
         closed_jaxpr = jax.make_jaxpr(lambda *a: example_use(tree, *a))(
@@ -297,7 +297,7 @@ def trace_callables(tree: Any, example_use: Callable, *shapes: tuple[int, ...], 
     """
     if not has_plain_functions_or_floats(tree, is_leaf):
         if not is_library_object(tree):
-            _check_indices_of(tree, example_use, shapes)
+            _check_indices_in_use(tree, example_use, shapes)
         return tree
     return trace_callables_and_result_shapes(tree, example_use, *shapes, is_leaf=is_leaf)[0]
 

@@ -89,12 +89,12 @@ def crystal_exchange(lattice_or_bonds: Lattice | Bonds, strength) -> Energy:
     if isinstance(strength, Mapping):
         if not strength:
             raise InputError("a mapping from shells to exchange constants must not be empty")
-        return Sum.of([_scalar_exchange(lattice_or_bonds.shell(number), J) for number, J in strength.items()])
+        return Sum.from_terms([_scalar_exchange(lattice_or_bonds.shell(number), J) for number, J in strength.items()])
     if isinstance(strength, list | tuple):
         if not strength:
             raise InputError("a list of exchange constants, one for each shell, must not be empty")
         shells = lattice_or_bonds.shells(len(strength))
-        return Sum.of([_scalar_exchange(shell, J) for shell, J in zip(shells, strength, strict=True)])
+        return Sum.from_terms([_scalar_exchange(shell, J) for shell, J in zip(shells, strength, strict=True)])
     return _scalar_exchange(lattice_or_bonds.shell(1), strength)
 
 

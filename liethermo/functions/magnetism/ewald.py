@@ -223,8 +223,8 @@ def _derivatives_for_two_periodic_axes(
     with np.errstate(divide="ignore", invalid="ignore"):
         mean = np.where(Q > 0.0, root / Q * (plus + minus), 0.0)
         directions = np.where(rho[:, None] > 0.0, transverse / rho[:, None], 0.0)
-    second = 4.0 * eta * gauss - root * Q * (plus + minus)
-    curvature = np.stack([transverse_projector[i, j] * second for i, j in COMPONENTS])
+    second_derivative = 4.0 * eta * gauss - root * Q * (plus + minus)
+    curvature = np.stack([transverse_projector[i, j] * second_derivative for i, j in COMPONENTS])
     return mean, (0.5 * root * (minus - plus))[:, None] * directions, curvature
 
 
@@ -247,12 +247,12 @@ def _integrals_for_one_periodic_axis(Q, rho, eta: float) -> tuple[np.ndarray, np
             sums[m] += value * u**m
     x = (eta * rho) ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
-        at_rest = [
+        zero_wave_limits = [
             np.where(x > 0.0, -np.expm1(-x) / rho**2, eta**2),
             np.where(x > SMALL_ARGUMENT, scipy.special.gammainc(2.0, x) / rho**4, 0.5 * eta**4),
         ]
     I0 = np.where(is_wave, sums[0], 0.0)
-    I1, I2 = (np.where(Q > 0.0, np.where(is_wave, sums[m], 0.0), at_rest[m - 1]) for m in (1, 2))
+    I1, I2 = (np.where(Q > 0.0, np.where(is_wave, sums[m], 0.0), zero_wave_limits[m - 1]) for m in (1, 2))
     return I0, I1, I2
 
 

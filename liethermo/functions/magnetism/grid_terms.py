@@ -187,17 +187,17 @@ def _lattice_bond_energy(shape, strength, vectors, neighbours, periodic, images:
     periodic_axes = (periodic,) * n_axes if isinstance(periodic, bool) else tuple(periodic)
     if len(periodic_axes) != n_axes:
         raise InputError(f"periodic must be True or False, or one for each of the {n_axes} axes, got {periodic!r}")
-    for first, second in itertools.combinations(offsets, 2):
-        opposite = [-o for o in second]
+    for offset_a, offset_b in itertools.combinations(offsets, 2):
+        opposite = [-o for o in offset_b]
         wrap = (
             (lambda offset: offset)
             if images
             else functools.partial(_wrap_offset, shape=shape, periodic_axes=periodic_axes)
         )
-        if wrap(first) in (wrap(second), wrap(opposite)) and any(wrap(first)):
+        if wrap(offset_a) in (wrap(offset_b), wrap(opposite)) and any(wrap(offset_a)):
             raise InputError(
-                f"the neighbours {first} and {second} name a pair twice. Give one of each two opposite offsets, and on "
-                "a periodic axis shorter ones"
+                f"the neighbours {offset_a} and {offset_b} name a pair twice. Give one of each two opposite offsets, "
+                "and on a periodic axis shorter ones"
             )
     coupling = strength if vectors is None else vectors
     couplings = (
@@ -230,7 +230,7 @@ def _lattice_bond_energy(shape, strength, vectors, neighbours, periodic, images:
             if vectors is None
             else BondEnergy(shape, tuple(offset), None, value)
         )
-    return Sum.of(terms)
+    return Sum.from_terms(terms)
 
 
 def _checked_offset(offset, n_axes: int) -> list[int]:
@@ -242,7 +242,7 @@ def _checked_offset(offset, n_axes: int) -> list[int]:
 
 
 def _neighbour_mask(shape, offset, periodic_axes) -> np.ndarray:
-    """Return which sites have a neighbour at an offset, as an array of the shape of the sites."""
+    """Return a mask, of the shape of the sites, of the sites that have a neighbour at an offset."""
     has_neighbour = np.ones(shape, dtype=bool)
     for axis, (n, shift, is_periodic) in enumerate(zip(shape, offset, periodic_axes, strict=True)):
         indices = np.arange(n) + shift
@@ -264,10 +264,10 @@ def _first_bond_of_pair_mask(shape, offset, periodic_axes) -> np.ndarray:
     On a periodic axis of length 1 or 2 an offset leads from a site to itself, or twice to one neighbour.
     """
     numbers = np.arange(math.prod(shape)).reshape(shape)
-    wrapped = _wrap_offset(offset, shape, periodic_axes)
-    if wrapped != _wrap_offset([-o for o in offset], shape, periodic_axes):
+    wrapped_offset = _wrap_offset(offset, shape, periodic_axes)
+    if wrapped_offset != _wrap_offset([-o for o in offset], shape, periodic_axes):
         return np.ones(shape, dtype=bool)
-    return numbers < np.roll(numbers, [-o for o in wrapped], axis=range(len(shape)))
+    return numbers < np.roll(numbers, [-o for o in wrapped_offset], axis=range(len(shape)))
 
 
 def _is_edge_list(graph) -> bool:

@@ -394,27 +394,27 @@ class Bonds:
         """Raise InputError if a bond joins a spin with itself, or two bonds join one pair, unless images count."""
         if self.lattice.images:
             return
-        cells, seen = self.lattice.cells, {}
+        cells, bond_by_pair = self.lattice.cells, {}
         for number, (a, b, offset) in enumerate(zip(self.first, self.second, self.offsets, strict=True)):
             if not self.presence(number).any():
                 continue
-            wrapped = tuple(
+            wrapped_offset = tuple(
                 int(o) % n if is_periodic else int(o)
                 for o, n, is_periodic in zip(offset, cells, self.lattice.periodic, strict=True)
             )
             opposite = tuple(
                 -o % n if is_periodic else -o
-                for o, n, is_periodic in zip(wrapped, cells, self.lattice.periodic, strict=True)
+                for o, n, is_periodic in zip(wrapped_offset, cells, self.lattice.periodic, strict=True)
             )
-            key, reverse = (int(a), int(b), wrapped), (int(b), int(a), opposite)
-            if key == reverse or key in seen or reverse in seen:
-                problem = "a spin with itself" if a == b and not any(wrapped) else "a pair of spins twice"
+            key, reverse = (int(a), int(b), wrapped_offset), (int(b), int(a), opposite)
+            if key == reverse or key in bond_by_pair or reverse in bond_by_pair:
+                problem = "a spin with itself" if a == b and not any(wrapped_offset) else "a pair of spins twice"
                 raise InputError(
                     f"the bond ({a}, {b}, {tuple(offset.tolist())}) joins {problem}, because the lattice of {cells} "
                     "cells is periodic and short. Use more cells, periodic=False along the short axis, or images=True "
                     "to count periodic images as neighbours"
                 )
-            seen[key] = number
+            bond_by_pair[key] = number
 
     def site_pairs(self) -> np.ndarray:
         """Return the pairs of sites that are joined, numbered in C order, shape (bonds, 2)."""

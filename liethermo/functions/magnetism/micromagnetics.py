@@ -148,8 +148,8 @@ def demagnetisation(cells: Lattice, saturation, constant: float = MAGNETIC_CONST
     edges = _checked_cell_edges(cells)
     if any(cells.periodic):
         raise InputError("the demagnetising field of periodic cells is not available. Use periodic=False")
-    padded = tuple(padded_length(n, False) for n in cells.cells)
-    tensors = mirror_octant(demagnetising_tensors(cells.cells, edges), padded)
+    padded_cells = tuple(padded_length(n, False) for n in cells.cells)
+    tensors = mirror_octant(demagnetising_tensors(cells.cells, edges), padded_cells)
     kernel = FourierKernel.from_tensors(tensors[:, None, None], cells.cells)
     M = checked_site_values(saturation, cells.sites, (), "a saturation magnetisation")
     strength = checked_numbers(constant, "the magnetic constant", ()) * cells.cell_volume

@@ -43,11 +43,11 @@ def demagnetising_tensors(cells: tuple[int, ...], size: np.ndarray) -> np.ndarra
     tensors = np.zeros((6, len(offsets)))
     is_near = distances <= CLOSED_FORM_DISTANCE
     tensors[:, is_near] = _closed_form_tensors(offsets[is_near], edges)
-    lower = CLOSED_FORM_DISTANCE
-    for upper, nodes in FAR_NODES:
-        is_far = (distances > lower) & (distances <= upper)
+    min_distance = CLOSED_FORM_DISTANCE
+    for max_distance, nodes in FAR_NODES:
+        is_far = (distances > min_distance) & (distances <= max_distance)
         tensors[:, is_far] = _mean_dipole_tensors(offsets[is_far] * edges, edges, nodes)
-        lower = upper
+        min_distance = max_distance
     return tensors.reshape(6, *cells)
 
 
@@ -76,11 +76,11 @@ def _closed_form_tensors(offsets: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
     They are computed in the widest floating-point format.
     """
-    wide = np.asarray(edges, dtype=np.longdouble)
+    wide_edges = np.asarray(edges, dtype=np.longdouble)
     result = np.zeros((6, len(offsets)), dtype=np.longdouble)
     for shift in itertools.product((-1, 0, 1), repeat=3):
         weight = np.prod([2.0 if s == 0 else -1.0 for s in shift])
-        x, y, z = ((offsets + shift) * wide).T
+        x, y, z = ((offsets + shift) * wide_edges).T
         values = (
             _newell_f(x, y, z),
             _newell_g(x, y, z),
@@ -91,7 +91,7 @@ def _closed_form_tensors(offsets: np.ndarray, edges: np.ndarray) -> np.ndarray:
         )
         for component, value in enumerate(values):
             result[component] += weight * value
-    return np.asarray(result / (4.0 * np.longdouble(np.pi) * np.prod(wide)), dtype=float)
+    return np.asarray(result / (4.0 * np.longdouble(np.pi) * np.prod(wide_edges)), dtype=float)
 
 
 def _newell_f(x, y, z):

@@ -118,6 +118,8 @@ class _DescentState(NamedTuple):
 
 @eqx.filter_jit
 def _descend_to_minimum(energy: Energy, is_flat: bool, unit_vectors, lengths, tolerance, max_steps):
+    """Return the unit vectors, energy and relative torque of a minimum, and the number of steps that found it."""
+
     def value_and_slope(unit_vectors):
         s = unit_vectors * lengths
         x = s.reshape(-1) if is_flat else s
@@ -149,11 +151,11 @@ def _descend_to_minimum(energy: Energy, is_flat: bool, unit_vectors, lengths, to
         next_step = jnp.where(
             curvature > 0.0, jnp.where(state.attempts % 2 == 0, long_step, short_step), 2.0 * state.step
         )
-        accepted = _DescentState(
+        accepted_state = _DescentState(
             unit_vectors, value, slope, torque, limit_rotation(next_step, slope), state.attempts + 1
         )
-        rejected = state._replace(step=0.25 * state.step, attempts=state.attempts + 1)
-        return jax.tree_util.tree_map(lambda a, b: jnp.where(is_accepted, a, b), accepted, rejected)
+        rejected_state = state._replace(step=0.25 * state.step, attempts=state.attempts + 1)
+        return jax.tree_util.tree_map(lambda a, b: jnp.where(is_accepted, a, b), accepted_state, rejected_state)
 
     value, slope, torque, scale = value_and_slope(unit_vectors)
     first_step = limit_rotation(1.0 / jnp.where(scale > 0.0, scale, 1.0), slope)

@@ -49,7 +49,7 @@ class SpinEnergy(Energy):
 
     @abstractmethod
     def lattice_gradients(self, spins: PeriodicSpins) -> VectorComponents:
-        """Return the gradients by the spins."""
+        """Return the gradient by each spin, as three arrays of components of the shape of the sites."""
 
     @property
     def is_quadratic(self) -> bool:

@@ -78,18 +78,18 @@ def spin_wave_frequencies(
         raise InputError(f"magnetic_cell must divide the cells {lattice.cells}, got {repeat}")
     _check_spins_repeat(s, lattice, repeat)
     gradient = np.asarray(function.gradient(s.ravel())).reshape(-1, 3)
-    flat = s.reshape(-1, 3)
-    torques = np.linalg.norm(np.cross(flat, gradient), axis=1) / np.linalg.norm(flat, axis=1)
+    flat_spins = s.reshape(-1, 3)
+    torques = np.linalg.norm(np.cross(flat_spins, gradient), axis=1) / np.linalg.norm(flat_spins, axis=1)
     if torques.max() > REST_TOLERANCE * max(np.linalg.norm(gradient, axis=1).max(), 1e-300):
         raise InputError(
             "spins must be a state of rest, but their torques do not vanish. Use lt.magnetism.minimise first"
         )
     numbers, members, offsets = _magnetic_cell_sites_and_offsets(lattice, repeat)
-    frames = np.empty((len(flat), 2, 3))
-    frames[numbers] = _local_frames(flat[members])
-    lengths = np.linalg.norm(flat[members], axis=1)
-    rows = _hessian_rows(function, flat, members, frames)
-    radial_slopes = np.sum(gradient[members] * flat[members], axis=1) / lengths**2
+    frames = np.empty((len(flat_spins), 2, 3))
+    frames[numbers] = _local_frames(flat_spins[members])
+    lengths = np.linalg.norm(flat_spins[members], axis=1)
+    rows = _hessian_rows(function, flat_spins, members, frames)
+    radial_slopes = np.sum(gradient[members] * flat_spins[members], axis=1) / lengths**2
     count = len(members)
     for k, i in enumerate(members):  # a spin moves on a sphere, whose curvature adds the slope along the spin
         rows[2 * k : 2 * k + 2, i] -= radial_slopes[k] * np.eye(2)
@@ -138,9 +138,11 @@ def _magnetic_cell_sites_and_offsets(
     axes = len(magnetic_cell)
     numbers = np.arange(lattice.site_count).reshape(*lattice.cells, atoms)
     counts = tuple(n // m for n, m in zip(lattice.cells, magnetic_cell, strict=True))
-    split = numbers.reshape(*(length for pair in zip(counts, magnetic_cell, strict=True) for length in pair), atoms)
-    ordered = split.transpose(*range(0, 2 * axes, 2), *range(1, 2 * axes, 2), 2 * axes)
-    table = ordered.reshape(math.prod(counts), -1)
+    split_numbers = numbers.reshape(
+        *(length for pair in zip(counts, magnetic_cell, strict=True) for length in pair), atoms
+    )
+    numbers_by_cell = split_numbers.transpose(*range(0, 2 * axes, 2), *range(1, 2 * axes, 2), 2 * axes)
+    table = numbers_by_cell.reshape(math.prod(counts), -1)
     grids = np.meshgrid(
         *(np.rint(np.fft.fftfreq(n, 1.0 / n)) * m for n, m in zip(counts, magnetic_cell, strict=True)), indexing="ij"
     )

@@ -164,11 +164,11 @@ def _cumulant_of_squares(squared_magnetisation) -> float:
 
 def _cumulant_temperature_derivative(squared_magnetisation, energy, temperature: float) -> float:
     """Return the derivative of Binder's cumulant by the temperature k T, from fluctuations of the energy."""
-    second, fourth = squared_magnetisation.mean(), (squared_magnetisation**2).mean()
+    second_moment, fourth_moment = squared_magnetisation.mean(), (squared_magnetisation**2).mean()
     changes = [
         ((x - x.mean()) * energy).mean() / temperature**2 for x in (squared_magnetisation, squared_magnetisation**2)
     ]
-    return float((2.0 * fourth * changes[0] / second - changes[1]) / (3.0 * second**2))
+    return float((2.0 * fourth_moment * changes[0] / second_moment - changes[1]) / (3.0 * second_moment**2))
 
 
 def _jackknife_variance(quantity: Callable, series: np.ndarray) -> float:

@@ -12,7 +12,7 @@ import manifolds as mf
 from liethermo.engines import array_engine
 from liethermo.engines.solver_options import DEFAULT_OPTIONS
 from liethermo.engines.step import initial_run_state_program, reorder_components, take_step
-from liethermo.functions.gradients import DISCRETE_GRADIENTS, stage_gradients
+from liethermo.functions.gradients import DISCRETE_GRADIENTS, discrete_gradients_at_stages
 from liethermo.functions.on_spaces import spins_to_component_order, spins_to_site_order
 from liethermo.integrators.base import pullback_method
 from liethermo.integrators.tableaus import gauss_tableau, kronrod_rule
@@ -92,7 +92,7 @@ def evaluate_functions(system, x, d, compensation, k):
         for scheme in DISCRETE_GRADIENTS.values()
         if scheme.is_coordinate_order_independent
     ]
-    stages = stage_gradients(energy, x, compensation, 0.1, k, A, b, kronrod_rule(2))
+    stages = discrete_gradients_at_stages(energy, x, compensation, 0.1, k, A, b, kronrod_rule(2))
     vectors = jnp.stack([energy.gradient(x), system.vector_field(x), *gradients, *stages])
     return jnp.stack([energy.value(x), energy.sensitivity(x)]), energy.rounding_scale(x), vectors
 
