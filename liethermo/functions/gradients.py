@@ -277,7 +277,7 @@ def _corrected_stage_gradients(term: Energy, path: CollocationPath, correction_w
     if term.is_quadratic:
         return jax.vmap(term.gradient)(path.points)
     x, compensation, k, h, b = path.start, path.compensation, path.slopes, path.h, path.b
-    change = FunctionChange.over_step(
+    change = FunctionChange.from_step(
         term,
         x,
         compensation,
@@ -354,7 +354,7 @@ class FunctionChange(NamedTuple):
     gradients: jax.Array
 
     @classmethod
-    def over_step(cls, term: Energy, x, compensation, d, points: list[jax.Array]) -> FunctionChange:
+    def from_step(cls, term: Energy, x, compensation, d, points: list[jax.Array]) -> FunctionChange:
         """Return the change of a term from x + compensation to x + compensation + d."""
         new_x, new_compensation = two_sum(x, compensation + d)
         # one vmap for all points, so that the gradient is compiled once

@@ -75,7 +75,7 @@ def composed_entropy_gradients(
         return casimir_gradient_frame(y).coefficients(S.gradient(y))
 
     coefficients = jax.vmap(entropy_coefficients)(h * (A @ rates))
-    entropy_change = FunctionChange.over_step(S, x, compensation, h * (b @ k), [])
+    entropy_change = FunctionChange.from_step(S, x, compensation, h * (b @ k), [])
     return jnp.einsum(
         "ij,jin->in",
         correct_gradients(entropy_change, coefficients, rates, CorrectionDirection.from_slopes(rates, b), h, b),

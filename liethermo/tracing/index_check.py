@@ -1,7 +1,7 @@
-"""Detection of constant indices out of range, with which JAX goes on silently.
+"""Detection of constant indices out of range, which JAX does not report.
 
-Of three components ``m[3]`` reads ``m[2]``, ``m.at[3].set(0.0)`` changes nothing, and ``jnp.take(m, 3)`` is NaN. The
-indices are found in a jaxpr before anything is computed. An access that states how it treats an index out of range,
+If m has three components, ``m[3]`` reads ``m[2]``, ``m.at[3].set(0.0)`` changes nothing, and ``jnp.take(m, 3)`` is NaN.
+The indices are found in a jaxpr before anything is computed. An access that states how it treats an index out of range,
 such as ``x.at[3].get(mode="fill")``, ``mode="clip"`` or ``mode="drop"``, is not checked, nor are computed indices.
 """
 
