@@ -87,6 +87,7 @@ def inverse_gradient(lagrangian: Energy, mu: jax.Array) -> jax.Array:
 
 @inverse_gradient.def_jvp
 def _inverse_gradient_jvp(primals, tangents):
+    """Return the inverse gradient and its tangent, from the derivative of ``grad l(xi) = mu``."""
     lagrangian, mu = primals
     lagrangian_dot, mu_dot = tangents
     xi = inverse_gradient(lagrangian, mu)

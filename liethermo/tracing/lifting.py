@@ -265,6 +265,7 @@ def _evaluate_equation(eqn: JaxprEqn, values: Sequence) -> list:
 
 
 def _debug_info_without_names(jaxpr: Jaxpr) -> DebugInfo:
+    """Return the debug information of a jaxpr without the names of its arguments and results."""
     return jaxpr.debug_info._replace(arg_names=None, result_paths=None)  # the arguments have changed
 
 

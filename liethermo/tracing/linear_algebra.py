@@ -98,6 +98,7 @@ def input_table_and_strides_or_none(builder, x: np.ndarray) -> tuple[str, tuple[
 
 
 def _make_table_and_strides(builder, x: np.ndarray) -> tuple[str, tuple[int, int]]:
+    """Return the name of a table that holds a matrix, and its strides; the table is an input in place if possible."""
     return input_table_and_strides_or_none(builder, x) or (builder.make_table(x.ravel().tolist()), (x.shape[1], 1))
 
 
@@ -123,13 +124,13 @@ def eigh(builder, eqn, a):
     return _map_matrices(builder, eqn, a, eigh_of_matrix)
 
 
-def _swap_row_with_pivot(builder, matrix: np.ndarray, k: int, pivot: Scalar) -> np.ndarray:
-    """Return a matrix with row k and row ``pivot`` exchanged, where ``pivot >= k``."""
-    matrix, row_k, candidate_rows = matrix.copy(), matrix[k].copy(), matrix[k:].copy()
+def _swap_row_with_pivot(builder, matrix: np.ndarray, row: int, pivot_row: Scalar) -> np.ndarray:
+    """Return a matrix with row k and row ``pivot_row`` exchanged, where ``pivot_row >= row``."""
+    matrix, row_k, candidate_rows = matrix.copy(), matrix[row].copy(), matrix[row:].copy()
     for j in range(matrix.shape[1]):
-        matrix[k, j] = builder.pick(builder.real_builder.sub(pivot, k), list(candidate_rows[:, j]))
-    for i in range(k + 1, len(matrix)):
-        is_hit = builder.real_builder.op("eq", pivot, i)
+        matrix[row, j] = builder.pick(builder.real_builder.sub(pivot_row, row), list(candidate_rows[:, j]))
+    for i in range(row + 1, len(matrix)):
+        is_hit = builder.real_builder.op("eq", pivot_row, i)
         for j in range(matrix.shape[1]):
             matrix[i, j] = builder.select(is_hit, row_k[j], matrix[i, j])
     return matrix

@@ -15,7 +15,7 @@ from manifolds._pytree_module import Module
 
 
 class NumpyCompatibleArray(NDArrayOperatorsMixin):
-    """An array of JAX that functions of NumPy accept: each calls the function of ``jax.numpy`` with its name."""
+    """A JAX array that NumPy's functions accept: each calls the function of ``jax.numpy`` that has its name."""
 
     def __init__(self, array: jax.Array):
         self.array = array
@@ -61,6 +61,7 @@ def unwrap_array(value: Any) -> Any:
 
 
 def _wrap_arrays(value: Any) -> Any:
+    """Return a pytree with each JAX array in it as a :class:`NumpyCompatibleArray`."""
     return jax.tree_util.tree_map(lambda a: NumpyCompatibleArray(a) if isinstance(a, jax.Array) else a, value)
 
 
@@ -74,7 +75,7 @@ def accept_jax_arrays(function: Callable) -> Callable:
 
 
 class PythonCall(Module):
-    """A function from arrays to a number that a program calls in Python: it cannot be traced.
+    """A function from arrays to a number that cannot be traced, so that programs call it in Python.
 
     An exception of the function is kept, and the value is NaN: see :meth:`raise_first_error`.
     """

@@ -75,6 +75,7 @@ def _identity(builder, eqn, *arrays):
 
 
 def _emit_deferred_block(builder, eqn, *arrays):
+    """Emit a :class:`DeferredBlock`, whose code is filled in later; return its results as arrays of scalars."""
     avals = [var.aval for var in eqn.outvars]
     results = builder.emit_block(DeferredBlock(real_scalar_kinds(avals)), *flatten_scalars(arrays))
     return unflatten_scalars(iter(results), avals)

@@ -36,7 +36,7 @@ class _InterpretationPlan(NamedTuple):
 
 @dataclass(frozen=True)
 class Program:
-    """Scalar instructions in order; each variable is assigned once.
+    """A scalar program: instructions in order, each of which assigns one new variable.
 
     Attributes
     ----------

@@ -131,7 +131,7 @@ def refuse_grid_arguments(neighbours, periodic, images: bool) -> None:
 
 
 def _checked_bonds(lattice_or_bonds) -> Bonds:
-    """Return bonds, the nearest neighbours of a lattice; raise InputError for other objects and for double bonds."""
+    """Return bonds, or those of nearest neighbours of a lattice; InputError for other objects and for double bonds."""
     if not isinstance(lattice_or_bonds, Lattice | Bonds):
         raise InputError(
             f"bonds must be those of lt.magnetism.lattice, or a lattice, got {type(lattice_or_bonds).__name__}"
@@ -180,7 +180,7 @@ def _bond_matrix_energy(bonds: Bonds, matrices, sign: float, quantity_name: str)
 
 
 class CrystalBondEnergy(SpinEnergy):
-    """An energy of the bonds of a crystal.
+    """Base class of energies of the bonds of a crystal.
 
     Attributes
     ----------

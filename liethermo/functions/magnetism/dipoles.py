@@ -159,9 +159,9 @@ class FourierKernel(Module):
     Attributes
     ----------
     components : tuple of six arrays, shape (atoms, atoms, *transformed cells), real or complex
-        The components xx, xy, xz, yy, yz, zz, in the order of axes of :meth:`_transform`. They are arrays of their own,
-        and real ones are not multiplied with complex modes: XLA would move slices or complex copies of them out of a
-        loop, one for each use, and then compute equal fields for each use.
+        The components xx, xy, xz, yy, yz, zz, in the order of axes of :meth:`_forward_transform`. They are arrays of
+        their own, and real ones are not multiplied with complex modes: XLA would move slices or complex copies of them
+        out of a loop, one for each use, and then compute equal fields for each use.
     cells, padded_cells : tuple of int
     """
 
@@ -187,17 +187,19 @@ class FourierKernel(Module):
 
     def convolve(self, s) -> jax.Array:
         """Return ``sum_j T(r_i - r_j) s_j``, for s of shape (3, atoms, *cells)."""
-        modes = self._transform(s)
+        modes = self._forward_transform(s)
         if jnp.iscomplexobj(self.components[0]):
-            return self._transform_back(self._multiply(modes))
-        return self._transform_back(jax.lax.complex(self._multiply(modes.real), self._multiply(modes.imag)))
+            return self._inverse_transform(self._multiply_modes(modes))
+        return self._inverse_transform(
+            jax.lax.complex(self._multiply_modes(modes.real), self._multiply_modes(modes.imag))
+        )
 
-    def _multiply(self, modes) -> jax.Array:
+    def _multiply_modes(self, modes) -> jax.Array:
         """Return the product of the kernel with modes, both real or both complex, shape (3, atoms, *modes)."""
         products = [[self.components[PAIR_INDEX[i][j]] * modes[j] for j in range(3)] for i in range(3)]
         return jnp.stack([jnp.sum(x + y + z, axis=1) for x, y, z in products])
 
-    def _transform(self, s) -> jax.Array:
+    def _forward_transform(self, s) -> jax.Array:
         """Return the Fourier modes of s, with the last axis, which is transformed first, before the other ones.
 
         So no transform of that axis has to pass over the zeros along the others, nor over strided memory.
@@ -207,7 +209,7 @@ class FourierKernel(Module):
         modes = jnp.moveaxis(modes, 2 + last_axis, 2)
         return jnp.fft.fftn(modes, [self.padded_cells[axis] for axis in other_axes], [3 + axis for axis in other_axes])
 
-    def _transform_back(self, modes) -> jax.Array:
+    def _inverse_transform(self, modes) -> jax.Array:
         *other_axes, last_axis = transform_axes(self.padded_cells)
         rows = jnp.fft.ifftn(modes, axes=[3 + axis for axis in other_axes])
         rows = rows[(..., *(slice(n) for axis, n in enumerate(self.cells) if axis != last_axis))]
@@ -262,7 +264,7 @@ def _ewald_lattice_kernel(lattice: Lattice, padded_cells: tuple[int, ...], bound
 
 
 def _cell_offsets(padded_cells: tuple[int, ...]) -> np.ndarray:
-    """Return the offsets of cells on a padded lattice, shape (*padded, d): 0, 1, …, -1 along each axis."""
+    """Return the offsets of cells on a padded lattice, shape (*padded_cells, d): 0, 1, …, -1 along each axis."""
     axes = [np.rint(np.fft.fftfreq(n, 1.0 / n)) for n in padded_cells]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 

@@ -313,10 +313,11 @@ class _SiteNames(Sequence):
         return 0
 
 
-def _checked_edges_and_vectors(edges, count: int) -> tuple[np.ndarray, jax.Array]:
+def _checked_edges_and_vectors(edges, n_sites: int) -> tuple[np.ndarray, jax.Array]:
+    """Return the site numbers, shape (m, 2), and vectors D, shape (m, 3), of checked edges ``(i, j, D)``."""
     for i, j, _ in edges:
-        if not (0 <= i < count and 0 <= j < count):
-            raise InputError(f"the edge ({i}, {j}) must join two of the {count} sites, which are numbered from 0")
+        if not (0 <= i < n_sites and 0 <= j < n_sites):
+            raise InputError(f"the edge ({i}, {j}) must join two of the {n_sites} sites, which are numbered from 0")
         if i == j:
             raise InputError(f"the edge ({i}, {j}) joins a site with itself")
     pairs = [frozenset(edge[:2]) for edge in edges]

@@ -205,8 +205,10 @@ def _version_of_line(line: str, file_name: str) -> int:
     raise FileError(f"{file_name} is not an OVF file of version 1.0 or 2.0: its first line is {line[:60]!r}")
 
 
-def _read_data(content: bytes, data_start: int, data_kind: str, version: int, count: int, file_name: str) -> np.ndarray:
-    """Return ``count`` numbers from the data of an OVF file, from ``data_start`` on; raise FileError if damaged."""
+def _read_data(
+    content: bytes, data_start: int, data_kind: str, version: int, n_numbers: int, file_name: str
+) -> np.ndarray:
+    """Return ``n_numbers`` numbers from the data of an OVF file, from ``data_start`` on; raise FileError if damaged."""
     if data_kind == "text":
         end = content.find(b"#", data_start)
         words = content[data_start : end if end >= 0 else len(content)].split()
@@ -214,16 +216,16 @@ def _read_data(content: bytes, data_start: int, data_kind: str, version: int, co
             numbers = np.array(words, dtype=float)
         except ValueError as error:
             raise FileError(f"{file_name} has data that are no numbers: {error}") from error
-        if len(numbers) != count:
-            raise FileError(f"{file_name} must have {count} numbers, got {len(numbers)}. The file is not complete")
+        if len(numbers) != n_numbers:
+            raise FileError(f"{file_name} must have {n_numbers} numbers, got {len(numbers)}. The file is not complete")
         return numbers
     if data_kind not in ("binary 4", "binary 8"):
         raise FileError(f"{file_name} has data of the kind {data_kind!r}. Text, binary 4 and binary 8 are read")
     width = int(data_kind[-1])
-    if len(content) < data_start + width * (count + 1):
-        raise FileError(f"{file_name} is not complete: it must have {count} numbers of {width} bytes")
+    if len(content) < data_start + width * (n_numbers + 1):
+        raise FileError(f"{file_name} is not complete: it must have {n_numbers} numbers of {width} bytes")
     for order in "<>" if version == 2 else "><":
-        numbers = np.frombuffer(content, dtype=np.dtype(f"{order}f{width}"), count=count + 1, offset=data_start)
+        numbers = np.frombuffer(content, dtype=np.dtype(f"{order}f{width}"), count=n_numbers + 1, offset=data_start)
         if numbers[0] == CHECK_VALUES[width]:
             return numbers[1:].astype(float)
     raise FileError(f"{file_name} is damaged: its data do not begin with the number {CHECK_VALUES[width]:.0f}")
