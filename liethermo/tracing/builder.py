@@ -183,7 +183,7 @@ class EnclosingScope:
 
     Attributes
     ----------
-    builder : Builder
+    builder : ProgramBuilder
         The builder of the outer program.
     inner_names, outer_scalars : dict
         The name that each outer scalar has inside, and the inverse of this map.
@@ -191,7 +191,7 @@ class EnclosingScope:
         The entries of each outer table, by its name inside.
     """
 
-    def __init__(self, builder: Builder):
+    def __init__(self, builder: ProgramBuilder):
         self.builder = builder
         self.inner_names: dict[Scalar, str] = {}
         self.outer_scalars: dict[Scalar, Scalar] = {}
@@ -214,7 +214,7 @@ class EnclosingScope:
 
 
 TABLE_MARK = "table"
-"""First of the two results of :meth:`Builder.prepare_pick` that stand for a table; no scalar has this name."""
+"""First of the two results of :meth:`ProgramBuilder.prepare_pick` that stand for a table; no scalar has this name."""
 
 MAX_TABLE_STRIDE = 256
 """Largest distance in memory that is tried between the entries of a table of which only one is not fixed."""
@@ -251,7 +251,7 @@ def replace_constants_by_strided_inputs(
     return entries
 
 
-class Builder:
+class ProgramBuilder:
     """Builds a scalar program: each method emits instructions and returns the scalar that holds their result.
 
     No instruction is emitted for a result that is known at compile time, that equals an earlier one, or that differs
@@ -286,7 +286,7 @@ class Builder:
         self.call_results: dict[tuple, tuple] = {}
 
     @property
-    def real_builder(self) -> Builder:
+    def real_builder(self) -> ProgramBuilder:
         """Builder of real scalars: this object; for a complex builder, the builder of its real and imaginary parts."""
         return self
 

@@ -8,7 +8,7 @@ from functools import reduce
 
 import numpy as np
 
-from .builder import Builder, ComplexPair, Scalar, as_complex_pair, scalar_array
+from .builder import ComplexPair, ProgramBuilder, Scalar, as_complex_pair, scalar_array
 
 
 def flatten_scalars(arrays: Sequence[np.ndarray]) -> list[Scalar]:
@@ -43,7 +43,7 @@ def real_scalar_kinds(avals: Sequence) -> tuple[str, ...]:
 class ComplexBuilder:
     """A builder of complex arithmetic, which calls a real builder for the real and imaginary parts."""
 
-    def __init__(self, real_builder: Builder):
+    def __init__(self, real_builder: ProgramBuilder):
         self.real_builder, self.max_instructions = real_builder, real_builder.max_instructions
 
     def add(self, a, b):

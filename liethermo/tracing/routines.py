@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from .builder import Builder, EnclosingScope, Scalar
+from .builder import EnclosingScope, ProgramBuilder, Scalar
 from .caching import LRUCache
 from .calls import MatrixProduct
 from .complex_numbers import flatten_scalars, real_scalar_kinds, unflatten_scalars
@@ -24,7 +24,7 @@ _routine_cache: LRUCache[tuple] = LRUCache(256)
 
 
 def call_routine_or_unroll(
-    builder: Builder, unroll: Callable, closed_jaxpr: ClosedJaxpr, arguments: Sequence[np.ndarray]
+    builder: ProgramBuilder, unroll: Callable, closed_jaxpr: ClosedJaxpr, arguments: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
     """Return the results of a function, computed by a routine if it is long enough, and unrolled otherwise.
 
@@ -46,7 +46,8 @@ def call_routine_or_unroll(
     )
     # the entry holds the jaxpr, so that no other object takes its id
     routine_call = _routine_cache.get_or_compute(
-        key, lambda: (closed_jaxpr, _RoutineCall.build(builder, unroll, closed_jaxpr, arguments, input_positions))
+        key,
+        lambda: (closed_jaxpr, _RoutineCall.build_or_none(builder, unroll, closed_jaxpr, arguments, input_positions)),
     )[1]
     return (
         unroll(builder, closed_jaxpr.jaxpr, closed_jaxpr.consts, arguments)
@@ -75,12 +76,12 @@ class _RoutineCall:
     result_sources: tuple[Scalar | tuple[int] | None, ...]
 
     @classmethod
-    def build(
-        cls, builder: Builder, unroll: Callable, closed_jaxpr: ClosedJaxpr, arguments, input_positions: Sequence
+    def build_or_none(
+        cls, builder: ProgramBuilder, unroll: Callable, closed_jaxpr: ClosedJaxpr, arguments, input_positions: Sequence
     ) -> _RoutineCall | None:
         """Unroll a function into a routine; None if it is too short to become one."""
         scope, argument_indices = EnclosingScope(builder), dict[Scalar, int]()  # index of each inner name
-        inner_builder, entries = Builder(builder.max_instructions, scope), list[Scalar]()
+        inner_builder, entries = ProgramBuilder(builder.max_instructions, scope), list[Scalar]()
         for x, aval, positions in zip(arguments, closed_jaxpr.in_avals, input_positions, strict=True):
             for kind, a in zip(real_scalar_kinds([aval]), flatten_scalars([x]), strict=True):
                 if type(a) in (str, float):
@@ -123,7 +124,9 @@ class _RoutineCall:
         )
         return cls(Routine(program), argument_sources, result_sources)
 
-    def emit_call(self, builder: Builder, scalars: Sequence[Scalar], closed_jaxpr: ClosedJaxpr) -> list[np.ndarray]:
+    def emit_call(
+        self, builder: ProgramBuilder, scalars: Sequence[Scalar], closed_jaxpr: ClosedJaxpr
+    ) -> list[np.ndarray]:
         """Emit a call of the routine for the entries of all arguments; return the results of the function."""
 
         def argument_scalar(source) -> Scalar:
@@ -139,6 +142,6 @@ class _RoutineCall:
         return unflatten_scalars(iter(entries), closed_jaxpr.out_avals)
 
 
-def _convert_to_kind(builder: Builder, kind: str, a: Scalar) -> Scalar:
+def _convert_to_kind(builder: ProgramBuilder, kind: str, a: Scalar) -> Scalar:
     """Convert a real number, the form in which routines pass values, to a kind: real, truth value or integer."""
     return a if kind == "f" else builder.op("ne", a, 0.0) if kind == "b" else builder.op("truncate", a)

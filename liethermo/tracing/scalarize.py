@@ -22,7 +22,15 @@ from manifolds.matrices import chains
 
 from ..errors import InputError, LiethermoError
 from . import indexing
-from .builder import Builder, EnclosingScope, LimitExceededError, Scalar, constant_array, map_elementwise, scalar_array
+from .builder import (
+    EnclosingScope,
+    LimitExceededError,
+    ProgramBuilder,
+    Scalar,
+    constant_array,
+    map_elementwise,
+    scalar_array,
+)
 from .complex_numbers import ComplexBuilder, flatten_scalars, real_scalar_kinds, unflatten_scalars
 from .primitives import SUPPORTED_PARAMETERS, UNROLLING_RULES
 from .program import Program, ScanLoop, WhileLoop, eliminate_dead_code_and_rename
@@ -112,7 +120,7 @@ def scalarize(
     UnsupportedPrimitive
         If a primitive has no rule, or the program exceeds the limit.
     """
-    builder = Builder(max_instructions)
+    builder = ProgramBuilder(max_instructions)
     inputs, arguments = [], []
     for i, var in enumerate(closed_jaxpr.jaxpr.invars):
         if var.aval.dtype != np.float64:
@@ -135,7 +143,7 @@ def scalarize(
 
 
 def _collect_program(
-    builder: Builder, inputs: Sequence, outputs: Sequence[Sequence[Scalar]], shapes: Sequence
+    builder: ProgramBuilder, inputs: Sequence, outputs: Sequence[Sequence[Scalar]], shapes: Sequence
 ) -> Program:
     """Return the program of the instructions that a builder has collected, without those that no output needs."""
     instructions, new_names = eliminate_dead_code_and_rename(
@@ -149,7 +157,7 @@ def _collect_program(
     )
 
 
-def _unroll_jaxpr(builder: Builder, jaxpr, consts, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
+def _unroll_jaxpr(builder: ProgramBuilder, jaxpr, consts, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Unroll a jaxpr; return its outputs as arrays of scalars."""
     values = dict(zip(jaxpr.constvars, map(constant_array, consts), strict=True))
     values.update(zip(jaxpr.invars, arguments, strict=True))
@@ -217,7 +225,7 @@ MOVE_PRIMITIVES = frozenset(
 """Primitives that compute nothing: their entries were rounded or wrapped where they were computed."""
 
 
-def _round_to_dtype(builder: Builder, eqn, results: list[np.ndarray]) -> list[np.ndarray]:
+def _round_to_dtype(builder: ProgramBuilder, eqn, results: list[np.ndarray]) -> list[np.ndarray]:
     """Return the results of an operation rounded to their data types: float32 rounded, integers wrapped around."""
     name, rounded_results = eqn.primitive.name, []
     for var, result in zip(eqn.outvars, results, strict=True):
@@ -364,12 +372,12 @@ class _LoopScope(EnclosingScope):
 
     def unroll_body(
         self, closed_jaxpr: ClosedJaxpr, arguments: Sequence[np.ndarray]
-    ) -> tuple[Builder, list[np.ndarray]]:
+    ) -> tuple[ProgramBuilder, list[np.ndarray]]:
         """Unroll the body of the loop once; return the builder that holds its instructions, and its results."""
-        body_builder = Builder(self.builder.max_instructions, self)
+        body_builder = ProgramBuilder(self.builder.max_instructions, self)
         return body_builder, _unroll_jaxpr(body_builder, closed_jaxpr.jaxpr, closed_jaxpr.consts, arguments)
 
-    def outer_scalars_read(self, builders: Sequence[Builder], results: Sequence[Scalar]) -> dict[Scalar, str]:
+    def outer_scalars_read(self, builders: Sequence[ProgramBuilder], results: Sequence[Scalar]) -> dict[Scalar, str]:
         """Return the inner names of the outer scalars that the instructions of a loop body read, by outer scalar."""
         names = {*results, *(a for builder in builders for i in builder.instructions for a in i.args)}
         return {a: name for a, name in self.inner_names.items() if name in names}
