@@ -19,7 +19,7 @@ from ..engines.adaptive_runs import EventOccurrence, EventRules
 from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..results.events import Events, EventSeries
 from ..systems import AttitudeSystem, DrivenSystem, EmbeddedSystem, System
-from ..tracing.numpy_calls import PythonCall, with_jax_arrays
+from ..tracing.numpy_calls import PythonCall, accept_jax_arrays
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import trace_callables
 
@@ -100,11 +100,11 @@ class EventSet:
         """True if a function cannot be traced and is called in Python."""
         return any(function.calls_python for function in self.functions)
 
-    def raise_error(self) -> None:
+    def raise_first_error(self) -> None:
         """Raise the exception of an event function that is called in Python, if there was one."""
         for function in self.functions:
             if isinstance(function, EventFunction) and isinstance(function.function, PythonCall):
-                function.function.raise_error()
+                function.function.raise_first_error()
 
 
 class EventSpecification:
@@ -248,7 +248,7 @@ def _checked_event_function(
     shapes = [argument.shape for argument in example]
     state_shape = jax.eval_shape(system.user_state, jax.ShapeDtypeStruct((system.dim,), jnp.float64)).shape
     failure: Exception | None = None
-    for traceable in (call, with_jax_arrays(call)):
+    for traceable in (call, accept_jax_arrays(call)):
         try:
             traced = trace_callables(traceable, lambda f, *a: f(*a), *shapes)
             value = jax.eval_shape(traced, *example)

@@ -22,8 +22,8 @@ from ..errors import InputError
 from ..functions.bath_energy import BodyBathsEnergy
 from ..functions.checks import checked_energy, trace_energies, with_polynomial_degrees
 from ..functions.energy import Energy, make_energy
-from ..functions.on_spaces import energy_of_vectors, flatten_site_functions
-from ..tracing.short_form import arguments_form
+from ..functions.on_spaces import energy_of_vectors, functions_of_flat_states
+from ..tracing.short_form import format_arguments
 from ..tracing.traced import trace_callables
 from .baths import NO_BATHS, BathEntropy, HeatBaths, checked_baths, poisson_with_baths
 from .check import AXIOM_TOLERANCE, CheckReport, check_system, require_axioms
@@ -71,7 +71,7 @@ class System(SystemInterface):
             "torque": self.torque_laws.name,
         }
         name = f"{self.dim} components" if state_space is None else state_space.name
-        return f"{type(self).__name__}({name}, {arguments_form(parts)})"
+        return f"{type(self).__name__}({name}, {format_arguments(parts)})"
 
     @with_library_settings
     def _build(
@@ -133,7 +133,7 @@ class System(SystemInterface):
                 )
         self.dissipation = None
         if dissipation is not None:
-            dissipation = flatten_site_functions(dissipation, self.shape)
+            dissipation = functions_of_flat_states(dissipation, self.shape)
             self.dissipation = _bind_dissipation(self, dissipation)
         if baths.number:
             _attach_baths(self, baths, bath_terms)
@@ -179,7 +179,7 @@ class System(SystemInterface):
 
     def energy_of_vectors(self, energy: Energy) -> Energy:
         """Return a function of flat states from a function of states in the shape that users see."""
-        return energy_of_vectors(flatten_site_functions(energy, self.shape), self.space)
+        return energy_of_vectors(functions_of_flat_states(energy, self.shape), self.space)
 
     def _trace_dissipation(self, dissipation: Dissipation) -> Dissipation:
         """Return the dissipation with its plain functions traced for the arguments that its force passes to them."""

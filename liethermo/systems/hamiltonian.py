@@ -28,7 +28,7 @@ from ..functions.density import (
     ExpectationValue,
     MeanEnergy,
     ModulatedExpectationValue,
-    choose_reference_level,
+    lower_level_of_smallest_gap,
 )
 from ..functions.energy import Energy, TimeDependent
 from ..functions.time_span import ContinuedSpline
@@ -60,7 +60,7 @@ def hamiltonian_energy(hamiltonian, times=None) -> tuple[int, Energy]:
     H = checked_hermitian(checked_square_matrix(hamiltonian, "the Hamiltonian"), "the Hamiltonian")
     with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
         b = jnp.asarray(mf.DensityMatrices(len(H)).vector(H))
-        reference = jnp.asarray(choose_reference_level(np.diag(H).real))
+        reference = jnp.asarray(lower_level_of_smallest_gap(np.diag(H).real))
     return len(H), MeanEnergy(b, reference)
 
 
@@ -118,7 +118,7 @@ def _energy_of_terms(terms: Sequence, times) -> tuple[int, Energy]:
     with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
         matrices = (sum(constant, np.zeros_like(H)), *modulated)
         static, *rows = (jnp.asarray(structure.vector(a)) for a in matrices)
-        reference = jnp.asarray(choose_reference_level(np.asarray(static)[: structure.size]))
+        reference = jnp.asarray(lower_level_of_smallest_gap(np.asarray(static)[: structure.size]))
     if not modulated:
         return structure.size, MeanEnergy(static, reference)
     initial = static

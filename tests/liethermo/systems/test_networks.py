@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import liethermo as lt
 from liethermo.engines import sparse_engine
-from liethermo.functions.gradients import DISCRETE_GRADIENTS, stage_gradients
+from liethermo.functions.gradients import DISCRETE_GRADIENTS, discrete_gradients_at_stages
 from liethermo.integrators.tableaus import gauss_tableau
 from liethermo.models.thermo_particles import grid_adjacency_matrix, heat_grid_solution
 from tests.cases import tolerance
@@ -71,7 +71,7 @@ def assert_both_laws(solution, content=0.0):
 def value_and_gradients(energy, x, d, k):
     """Value, gradient and all discrete gradients."""
     A, b, _ = gauss_tableau(2)
-    stages = stage_gradients(energy, x, 0.0 * x, 0.1, k, A, b)
+    stages = discrete_gradients_at_stages(energy, x, 0.0 * x, 0.1, k, A, b)
     return [energy.value(x), energy.gradient(x), *(g(energy, x, d) for g in DISCRETE_GRADIENTS.values()), stages]
 
 
