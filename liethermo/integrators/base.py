@@ -344,11 +344,6 @@ def checked_stages(stages) -> int:
     return stages
 
 
-def kind_or_class_name(value) -> str:
-    """Return the kind of a system, or the class name of any other object."""
-    return value.kind if isinstance(value, System) else type(value).__name__
-
-
 def checked_step_size(h) -> jax.Array:
     """Return the step size of a run as a finite scalar that is not zero."""
     h = checked_numbers(h, "the step h", ())
