@@ -151,6 +151,7 @@ class HeatlessDissipation(LiftedDissipation):
 
 
 def _body_inner_geometry(system: Geometry, x) -> LiftedGeometry:
+    """Return the geometry of the body alone, whose states are the leading components of those with baths."""
     return LiftedGeometry.from_leading_components(system.drop_baths(), x, system.body_dim)
 
 

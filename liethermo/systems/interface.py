@@ -382,6 +382,10 @@ class SystemInterface(Geometry):
         """Return the known Casimirs of the Poisson structure, by name."""
         return {}
 
+    def casimir_components(self) -> dict[str, dict[str, Energy]]:
+        """Return, by the name of a Casimir that is a sum, its terms by name, if each of them is a Casimir too."""
+        return {}
+
     @property
     def orbit_levels(self) -> OrbitLevels:
         """Casimirs whose common levels are the orbits of the group, and whether all Casimirs are known."""

@@ -27,6 +27,7 @@ from ..functions.energy import Energy
 from ..functions.magnetism.spin_energy import lattice_shape
 from ..functions.magnetism.spin_torques import checked_spin_torque
 from ..functions.on_spaces import (
+    HalfSquareOfSpin,
     HalfSumOfSquares,
     Spheres,
     energy_in_component_order,
@@ -255,6 +256,10 @@ class SpinSystem(TorqueSystem):
 
     def casimirs(self) -> dict[str, Energy]:
         return {SPIN_LENGTHS_NAME: HalfSumOfSquares(math.prod(self.lattice))}
+
+    def casimir_components(self) -> dict[str, dict[str, Energy]]:
+        count = math.prod(self.lattice)
+        return {SPIN_LENGTHS_NAME: {f"|s|^2 / 2 at {i + 1}": HalfSquareOfSpin(i) for i in range(count)}}
 
     @property
     def surface(self) -> Spheres:
