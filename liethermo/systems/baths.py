@@ -59,6 +59,8 @@ class HeatBaths(Module):
     ----------
     energy : Energy
         Total energy of the baths as a function of their entropies, shape (number,).
+    number : int
+        The number of baths. ``system.baths.number`` is 0 for a system without baths.
 
     Raises
     ------

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 from ..errors import InputError
 from .base import System
 
-Kind = TypeVar("Kind", bound=System)
+KindOfSystem = TypeVar("KindOfSystem", bound=System)
 
 
 def user_system(system: System) -> System:
@@ -39,7 +39,7 @@ def require_system(value: Any, requirement: str) -> System:
     return value
 
 
-def require_kind(system: Any, kind: type[Kind], user_name: str) -> Kind:
+def require_kind(system: Any, kind: type[KindOfSystem], user_name: str) -> KindOfSystem:
     """Return the system if it is of a kind, such as QuantumSystem, that ``user_name`` needs.
 
     Raises
