@@ -16,6 +16,7 @@ import manifolds as mf
 from manifolds._pytree_module import Module
 
 from ..errors import InputError
+from ..tracing.short_form import callable_name
 from .energy import Energy, Linear
 
 NEGATIVE_EIGENVALUE_LIMIT = 1e-12
@@ -220,7 +221,7 @@ class DensityMatrixFunction(Module):
 
     @property
     def __name__(self) -> str:
-        return getattr(self.function, "__name__", "preserved")
+        return callable_name(self.function, "preserved")
 
     def __call__(self, x):
         return self.function(self.structure.matrix(x[: self.structure.dim]))

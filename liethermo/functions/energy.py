@@ -24,7 +24,7 @@ from manifolds._pytree_module import Module, forward_to
 
 from ..errors import FunctionError, InputError
 from ..tracing.programs import jit_subprogram
-from ..tracing.short_form import short_form
+from ..tracing.short_form import callable_name, short_form
 from .conditions import checked_numbers
 from .indices import (
     ComponentMap,
@@ -668,7 +668,7 @@ class Sum(Energy):
 
 def function_name(energy: Energy) -> str:
     """Return the name of the plain function of an energy; "" if there is none."""
-    return getattr(energy.function, "__name__", "") if isinstance(energy, Function | TimeDependent) else ""
+    return callable_name(energy.function, "") if isinstance(energy, Function | TimeDependent) else ""
 
 
 def make_energy(function, role: str) -> Energy:

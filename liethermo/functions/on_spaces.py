@@ -24,6 +24,7 @@ from manifolds.structures.spins import (
     sum_of_dots,
 )
 
+from ..tracing.short_form import callable_name
 from .bath_energy import BodyBathsEnergy
 from .energy import Energy, Function, Multiple, Negative, Pullback, Quadratic, Sum, TimeDependent
 from .indices import ComponentMap
@@ -103,7 +104,7 @@ class _FunctionOfFlatState(Module):
 
     @property
     def __name__(self) -> str:
-        return getattr(self.function, "__name__", type(self.function).__name__)
+        return callable_name(self.function)
 
     def __call__(self, x, *time):
         return self.function(x.reshape(self.shape), *time)

@@ -16,10 +16,11 @@ from ..errors import InputError
 from ..integrators import MetriplecticRungeKutta, OneStepMethod
 from ..results.solution import Solution
 from ..runs.adaptive import Adaptive
-from ..runs.events import EventSpecification
+from ..runs.events import EventSpecification, event_direction, event_terminal
 from ..runs.integrate import integrate, solution_without_steps
 from ..runs.schedule import clip_times_to_span
 from ..systems import System
+from ..systems.kinds import require_system
 
 __all__ = ["OdeResult", "solve_ivp"]
 __dir__ = public_dir(__all__)
@@ -126,8 +127,7 @@ def solve_ivp(
     InputError
         If an argument cannot be used. A step that fails does not raise: ``success`` is False, as in SciPy.
     """
-    if not isinstance(fun, System):
-        raise InputError(f"fun must be a system such as lt.LiePoissonSystem, got {type(fun).__name__}")
+    require_system(fun, "fun must be a system such as lt.LiePoissonSystem")
     for name in options:
         reason = (
             "the methods take it from the system" if name in UNSUPPORTED_OPTIONS else "solve_ivp has no such option"
@@ -140,7 +140,7 @@ def solve_ivp(
     saved_times = None if t_eval is None else _checked_times(t_eval, start, end)
     _check_first_step(first_step, end - start)
     arguments = _checked_args(args)
-    is_terminal = any(getattr(function, "terminal", False) for function in functions)
+    is_terminal = any(event_terminal(function) for function in functions)
     if math.isinf(end) and not is_terminal:
         raise InputError("an infinite end needs an event that ends the run. Set event.terminal = True, or a finite end")
     method = MetriplecticRungeKutta(order=8) if method is None else method
@@ -222,7 +222,7 @@ def _is_initial_event(
 ) -> bool:
     """Return whether an event function has an event at the start of a run: it is zero, and leaves in its direction."""
     (start, end), x = span, np.asarray(fun.state(y0)).reshape(np.shape(y0))
-    direction = getattr(function, "direction", 0) or 0
+    direction = event_direction(function)
     if float(function(start, x, *arguments)) != 0.0:
         return False
     if direction == 0 or end == start:
@@ -234,7 +234,7 @@ def _is_initial_event(
 
 
 def _ends_at_start(function: Callable, is_zero: bool) -> bool:
-    return is_zero and getattr(function, "terminal", False) == 1
+    return is_zero and event_terminal(function) == 1
 
 
 def _empty_span_result(

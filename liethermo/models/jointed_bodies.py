@@ -104,9 +104,8 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         if self.orbit is None:
             return replace(laws, name=" + ".join(filter(None, [laws.name, motors])))
         name = " + ".join(filter(None, [laws.name, "gradient of gravity", motors]))
-        return TorqueLaws(
-            name, has_impulse=True, needs_attitude=True, changed_casimirs=frozenset(self.momentum_casimirs())
-        )
+        changed_casimirs = frozenset(self.momentum_casimirs())
+        return TorqueLaws(name, True, not self.has_fixed_attitude, changed_casimirs)
 
     def _torque_at(self, x, t, attitude):
         k = self.mechanism.n_joints

@@ -18,6 +18,7 @@ from ..integrators import OneStepMethod
 from ..results.solution import Solution
 from ..systems import System
 from ..systems.invariants import stack_gradients
+from ..systems.kinds import require_system
 from ..systems.linearisation import conserved_functions, counter_components
 from ..tracing.interpret import evaluate_at_points
 from .propagator import Propagator
@@ -159,8 +160,7 @@ def steady_cycle(
     >>> cycle.work < 0.0, round(cycle.efficiency, 12), 1 - 1.0 / 2.0
     (True, 0.5, 0.5)
     """
-    if not isinstance(system, System):
-        raise InputError(f"system must be a system such as lt.models.rigid_body(), got {type(system).__name__}")
+    require_system(system, "system must be a system such as lt.models.rigid_body()")
     if not system.is_driven:
         raise InputError(f"this {system.kind} does not depend on time. Its state at rest is lt.steady_state(system)")
     if not (isinstance(period, int | float | np.number) and np.isfinite(period) and period > 0.0):

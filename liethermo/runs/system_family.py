@@ -18,6 +18,7 @@ from ..errors import InputError, LiethermoError
 from ..models.inertia import are_inertia_tensors
 from ..results.audit_evidence import energy_and_entropy, rounding_scales
 from ..systems import System
+from ..systems.kinds import require_system
 from ..tracing.caching import fingerprint
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.traced import TracedFunction, trace_function
@@ -117,9 +118,7 @@ class Family:
 
         def rebuild(arrays):
             system = build(jax.tree_util.tree_unflatten(structure, arrays))
-            if not isinstance(system, System):
-                raise InputError(f"the function must return a system, got {type(system).__name__}")
-            return system
+            return require_system(system, "the function must return a system")
 
         shapes = tuple(value.shape[1:] for value in values)
         return cls(ProgramStructure((build, structure), shapes, rebuild), values, n_builder_arrays=len(values))

@@ -28,6 +28,7 @@ from ..studies.axes import Zipped, latin_hypercube, sobol, zipped
 from ..studies.measures import At
 from ..studies.study import Study
 from ..systems import System
+from ..tracing.short_form import callable_name
 from .schema import (
     SECTIONS,
     AdaptiveStep,
@@ -82,7 +83,7 @@ def _describe_fault(key: str, fault: Mapping[str, Any], schema: type, consumer: 
             f"{name}: no such key{suggest_match(fault['loc'][-1], keys)}; {consumer} takes {', '.join(keys) or 'none'}"
         )
     if fault["type"] == "missing":
-        field = getattr(schema, "model_fields", {}).get(fault["loc"][-1])
+        field = _model_fields(schema).get(fault["loc"][-1])
         return f"{name} is missing" + (f": {field.description}" if field else f"; {consumer} needs it")
     if fault["type"] in ("model_type", "dict_type"):
         return f"{name} = {format_value(fault['input'])}: must be a section [{name}]"
@@ -104,12 +105,15 @@ def _allowed_keys(schema: type, location: tuple) -> list[str]:
     for part in location[:-1]:
         if isinstance(part, str) and part in SCHEMA_BY_TAG:
             schema = SCHEMA_BY_TAG[part]
-        elif (field := getattr(schema, "model_fields", {}).get(part)) is not None:
-            nested_models = [
-                kind for kind in (field.annotation, *get_args(field.annotation)) if hasattr(kind, "model_fields")
-            ]
+        elif (field := _model_fields(schema).get(part)) is not None:
+            nested_models = [kind for kind in (field.annotation, *get_args(field.annotation)) if _model_fields(kind)]
             schema = nested_models[0] if nested_models else schema
-    return list(getattr(schema, "model_fields", None) or schema.__annotations__)
+    return list(_model_fields(schema) or schema.__annotations__)
+
+
+def _model_fields(schema: Any) -> dict[str, Any]:
+    """Return the fields of a model of pydantic; {} for a typed dictionary or any other type."""
+    return getattr(schema, "model_fields", {})
 
 
 def validate_arguments(key: str, function: Callable, table: dict, problems: list[str]) -> dict[str, Any] | None:
@@ -126,7 +130,7 @@ def validate_arguments(key: str, function: Callable, table: dict, problems: list
             fields[name] = requirement[_toml_value_type(hints.get(name, Any))]
         elif parameter.kind is parameter.VAR_KEYWORD:
             extra = "allow"
-    name = getattr(function, "__name__", "the function")
+    name = callable_name(function, "the function")
     schema = with_config(ConfigDict(extra=extra))(TypedDict(name, fields))  # type: ignore[operator]
     return validate_table(key, schema, table, problems, name)
 

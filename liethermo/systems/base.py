@@ -23,9 +23,9 @@ from ..functions.bath_energy import BodyBathsEnergy
 from ..functions.checks import checked_energy, trace_energies, with_polynomial_degrees
 from ..functions.energy import Energy, make_energy
 from ..functions.on_spaces import energy_of_vectors, functions_of_flat_states
-from ..tracing.short_form import format_arguments
+from ..tracing.short_form import callable_name, format_arguments
 from ..tracing.traced import trace_callables
-from .baths import NO_BATHS, BathEntropy, HeatBaths, checked_baths, poisson_with_baths
+from .baths import ABSENT_BATHS, BathEntropy, HeatBaths, checked_baths, poisson_with_baths
 from .check import AXIOM_TOLERANCE, CheckReport, check_system, require_axioms
 from .conservation import project_covector
 from .interface import SystemInterface
@@ -152,7 +152,7 @@ class System(SystemInterface):
             space=None if self.space is None else _drop_last_factor(self.space),
             poisson=self.poisson.first,
             energy=self.energy.body if isinstance(self.energy, BodyBathsEnergy) else self.energy,
-            baths=NO_BATHS,
+            baths=ABSENT_BATHS,
         )
 
     @with_library_settings
@@ -370,7 +370,7 @@ def name_momentum_maps(given) -> dict[str, Any]:
         return dict(given)
     if not isinstance(given, Sequence) or isinstance(given, str):
         raise InputError(f"momentum_maps must be a dict or a sequence of functions, got {type(given).__name__}")
-    return {getattr(J, "__name__", f"J{i + 1}"): J for i, J in enumerate(given)}
+    return {callable_name(J, f"J{i + 1}"): J for i, J in enumerate(given)}
 
 
 __all__ = ["AXIOM_TOLERANCE", "System", "name_momentum_maps"]

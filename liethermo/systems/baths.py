@@ -59,6 +59,8 @@ class HeatBaths(Module):
     ----------
     energy : Energy
         Total energy of the baths as a function of their entropies, shape (number,).
+    number : int
+        The number of baths. ``system.baths.number`` is 0 for a system without baths.
 
     Raises
     ------
@@ -144,14 +146,14 @@ class HeatBaths(Module):
         return jnp.where(jnp.isfinite(self.energy.capacity), self.energy.capacity, 1.0)
 
 
-class _NoBaths(HeatBaths):
+class _AbsentBaths(HeatBaths):
     """Baths of number zero, of a system without baths."""
 
     def __init__(self):
         self.energy, self.number = ZeroEnergy(), 0
 
 
-NO_BATHS = _NoBaths()
+ABSENT_BATHS = _AbsentBaths()
 """The baths of a system that has none."""
 
 
@@ -164,7 +166,7 @@ def checked_baths(baths: HeatBaths | None) -> HeatBaths:
     """
     if not isinstance(baths, HeatBaths | None):
         raise InputError(f"baths must be lt.HeatBaths(...), got {type(baths).__name__}")
-    return NO_BATHS if baths is None else baths
+    return ABSENT_BATHS if baths is None else baths
 
 
 def _entries_of_baths(value, what: str, number: int) -> list:

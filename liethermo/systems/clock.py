@@ -49,6 +49,10 @@ class Clock(Module):
         """Return the time t of states, shape (...), clipped to the span of the run."""
         return self.span.clip(x[..., self.index] / self.unit)
 
+    def work(self, x) -> jax.Array:
+        """Return the work W of states, shape (...)."""
+        return x[..., self.index + 1] / self.unit
+
     def work_direction(self, dim: int) -> jax.Array:
         """Return the displacement, shape (dim,), that adds one unit to the work done."""
         return jnp.zeros(dim).at[self.index + 1].set(self.unit)

@@ -211,6 +211,10 @@ class LiePoissonSystem(TorqueSystem):
 
     # -- the torque -----------------------------------------------------------------------------------------------
 
+    def bind_attitude(self, attitude) -> LiePoissonSystem:
+        """Return the system itself: without a clock its torque, if any, is frozen at a time and an attitude."""
+        return self
+
     def _set_torque(self, torque) -> None:
         """Set the fields of the torque of a system with an algebra and a group."""
         self.torque, self.torque_argument_counts = traced_torque_and_argument_counts(torque, self.algebra, self.group)
@@ -226,10 +230,11 @@ class LiePoissonSystem(TorqueSystem):
             return TORQUE_FREE_LAWS
         n_momenta = self.algebra.dim if self.group is None else self.group.dim
         free, names = self.torque_free_components, self.algebra.basis_names
+        takes_attitude = max(self.torque_argument_counts) > MAX_ARGUMENTS_WITHOUT_ATTITUDE
         return TorqueLaws(
             torque_name(self.torque),
             has_impulse=not set(range(n_momenta)) <= set(free),
-            needs_attitude=max(self.torque_argument_counts) > MAX_ARGUMENTS_WITHOUT_ATTITUDE,
+            needs_attitude=takes_attitude and not self.has_fixed_attitude,
             changed_casimirs=frozenset(self.momentum_casimirs()) - _casimirs_of_components(self.algebra, names, free),
         )
 

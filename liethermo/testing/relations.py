@@ -20,7 +20,7 @@ from ..functions.gradients import EPS
 from ..integrators import DEFAULT_METHOD, MetriplecticTaylor, OneStepMethod
 from ..integrators.base import is_permutation_equivariant
 from ..runs.adaptive import Adaptive
-from ..systems import LiePoissonSystem, System
+from ..systems import System
 from .relation_case import RelationCase, SkipReason, nearby_state
 from .run_relations import (
     check_diffrax,
@@ -183,7 +183,7 @@ def _check_linear_map(case: RelationCase, description: str, matrix: np.ndarray, 
         and is_permutation_equivariant(case.method)
         and not any(isinstance(term, Pullback) for term in system.energy.terms)
     )
-    has_same_names = not isinstance(system, LiePoissonSystem)  # another basis has other Casimirs
+    has_same_names = system.lie_algebra is None  # another basis has other Casimirs
     case.compare_run(
         description, run, change.to_old, case.rounding_tolerance if exact else case.resolution_tolerance, has_same_names
     )

@@ -15,7 +15,7 @@ from jax.extend.core import ClosedJaxpr, DebugInfo, Jaxpr, JaxprEqn, Literal, Va
 from manifolds._content_keys import content_key
 from manifolds.matrices.exponential import expm
 
-from .searches import has_while_loop
+from .searches import aval_dtype, has_while_loop
 
 MAX_INLINE_NUMBERS = 64
 """Largest number of entries of an array that is recomputed from its origin; a larger one is stored as a table."""
@@ -152,7 +152,7 @@ class _LiftedBody:
         """Lift a constant if it is a tracer or a float64 array that need not stay constant; return its variable."""
         if isinstance(value, jax.core.Tracer):
             return self._lift_number(value, var.aval)
-        if getattr(var.aval, "dtype", None) == np.float64 and not must_stay_constant:
+        if aval_dtype(var.aval) == np.float64 and not must_stay_constant:
             return self._lift_number(value if isinstance(value, jax.Array) else np.asarray(value), var.aval)
         return self._keep_constant(Var(var.aval), value)
 
@@ -270,18 +270,18 @@ def _debug_info_without_names(jaxpr: Jaxpr) -> DebugInfo:
 
 
 def _is_inexact(aval) -> bool:
-    dtype = getattr(aval, "dtype", None)
+    dtype = aval_dtype(aval)
     return dtype is not None and jnp.issubdtype(dtype, jnp.inexact)
 
 
 def _is_large_float64(var: Var) -> bool:
     aval: Any = var.aval
-    return getattr(aval, "dtype", None) == np.float64 and aval.size > MAX_INLINE_NUMBERS
+    return aval_dtype(aval) == np.float64 and aval.size > MAX_INLINE_NUMBERS
 
 
 def _is_liftable_literal(atom) -> bool:
     """Return whether an atom is a literal that is lifted: a nonzero scalar of double precision."""
-    if not isinstance(atom, Literal) or getattr(atom.aval, "dtype", None) != np.float64:
+    if not isinstance(atom, Literal) or aval_dtype(atom.aval) != np.float64:
         return False
     return bool(atom.val != 0.0) and np.shape(atom.val) == ()
 

@@ -42,7 +42,7 @@ CHECKSUM_BYTES = 32
 MAX_FILE_BYTES = 2**28
 """Largest size in bytes of a file that is read."""
 
-SAFE_OPEN_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
+SAFE_OPEN_FLAGS = disk.SAFE_OPEN_FLAGS | getattr(os, "O_NONBLOCK", 0)
 """Flags that refuse to open a link and do not wait for the other end of a pipe."""
 
 
@@ -272,7 +272,7 @@ def _load_stored_program(name: str, lowered_program: Any) -> Callable | None:
 @functools.cache
 def _compiler_identity() -> str:
     """Return a text that identifies this machine and its compiler; XLA divides work among the cores it sees."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    cores = disk.available_cores()
     flags = os.environ.get("XLA_FLAGS", "")
     return f"{host_processor()} {cores} {jax.__version__} {jaxlib.__version__} {flags}"
 

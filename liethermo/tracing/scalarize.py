@@ -35,7 +35,7 @@ from .complex_numbers import ComplexBuilder, flatten_scalars, real_scalar_kinds,
 from .primitives import SUPPORTED_PARAMETERS, UNROLLING_RULES
 from .program import Program, ScanLoop, WhileLoop, eliminate_dead_code_and_rename
 from .routines import MIN_ROUTINE_INSTRUCTIONS, call_routine_or_unroll
-from .searches import has_matrix_products
+from .searches import aval_dtype, has_matrix_products
 
 MAX_INSTRUCTIONS = 200_000
 """Largest number of instructions of a program: far more than compile in reasonable time."""
@@ -163,7 +163,7 @@ def _unroll_jaxpr(builder: ProgramBuilder, jaxpr, consts, arguments: Sequence[np
     values.update(zip(jaxpr.invars, arguments, strict=True))
 
     def read(v) -> np.ndarray:
-        return constant_array(v.val, getattr(v.aval, "dtype", None)) if isinstance(v, Literal) else values[v]
+        return constant_array(v.val, aval_dtype(v.aval)) if isinstance(v, Literal) else values[v]
 
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
@@ -210,8 +210,8 @@ def _check_and_return_is_complex(eqn) -> bool:
             if name not in SUPPORTED_PARAMETERS.split() and value is not None:
                 raise NotImplementedError(f"with {name}={value}")
     for var in (*eqn.invars, *eqn.outvars):
-        dtype = getattr(var.aval, "dtype", None)
-        if getattr(dtype, "kind", None) not in ("f", "i", "u", "b", "c") or dtype in UNSUPPORTED_DTYPES:
+        dtype = aval_dtype(var.aval)
+        if not isinstance(dtype, np.dtype) or dtype.kind not in "fiubc" or dtype in UNSUPPORTED_DTYPES:
             raise NotImplementedError(f"on {var.aval}")
     return any(var.aval.dtype.kind == "c" for var in (*eqn.invars, *eqn.outvars))
 

@@ -44,6 +44,11 @@ def has_matrix_products(jaxpr: Jaxpr) -> bool:
     )
 
 
+def aval_dtype(aval: Any) -> Any:
+    """Return the type of the numbers of an abstract value of JAX; None for a token, which has no numbers."""
+    return getattr(aval, "dtype", None)
+
+
 def has_while_loop(jaxpr: Jaxpr) -> bool:
     """Return whether a jaxpr contains a ``while`` loop."""
     return any(equation.primitive.name == "while" for equation, _ in iterate_equations(jaxpr))

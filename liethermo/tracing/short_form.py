@@ -67,6 +67,16 @@ def format_arguments(arguments: Mapping[str, Any], depth: int = 1) -> str:
     )
 
 
+def callable_name(function: Any, default: str | None = None) -> str:
+    """Return the name of a function; for an object without a name ``default``, or else the name of its class."""
+    return getattr(function, "__name__", type(function).__name__ if default is None else default)
+
+
+def qualified_name(function: Any) -> str:
+    """Return the name of a function with those of the classes and functions around it, or the name of its class."""
+    return getattr(function, "__qualname__", type(function).__name__)
+
+
 def is_named_callable(value: Any) -> bool:
     """Return whether a value is a function, or an object that stands for one and has its name."""
     return callable(value) and hasattr(value, "__name__")

@@ -27,6 +27,7 @@ from manifolds._pytree_module import Module
 from ..errors import FunctionError
 from .index_check import check_indices
 from .lifting import ConstantLifter
+from .short_form import callable_name
 from .trace_errors import check_not_none, check_precision
 
 
@@ -176,7 +177,7 @@ def _with_forward_mode_derivatives(function: Callable) -> Callable:
 def trace_function(function: Callable, *arguments) -> TracedFunction:
     """Trace a function of arrays of given shapes (``jax.ShapeDtypeStruct``); return it as a pytree of its numbers."""
     is_library_code = is_library_object(function)
-    name = getattr(function, "__name__", type(function).__name__)
+    name = callable_name(function)
 
     def evaluate(*values):  # a new function object: JAX caches traces by it, and globals that it reads may change
         result = function(*values)
@@ -306,7 +307,7 @@ class _CallRecorder:
     """A plain function that traces itself for the shapes of the arguments with which it is called."""
 
     def __init__(self, function: Callable):
-        self.function, self.__name__ = function, getattr(function, "__name__", type(function).__name__)
+        self.function, self.__name__ = function, callable_name(function)
         self._traced_functions: dict[tuple, TracedFunction] = {}
         self._is_called_otherwise = False
 

@@ -174,6 +174,20 @@ def test_the_number_of_baths_is_that_of_their_entries():
     assert lt.HeatBaths(3.0, 2.0).number == lt.HeatBaths().number == 1
 
 
+def test_a_system_without_baths_has_baths_of_number_zero():
+    """Its baths may be given to another system, which has none either."""
+    zeeman = lt.magnetism.zeeman(1, (0.0, 0.0, FIELD))
+    system = lt.SpinSystem(1, zeeman, lt.LandauLifshitz(RATE))
+    again = lt.SpinSystem(1, zeeman, lt.LandauLifshitz(RATE), baths=system.baths)
+    assert system.baths.number == again.baths.number == 0
+    assert system.dim == system.body_dim == again.dim == 3
+    assert repr(again) == repr(system)
+    assert np.array_equal(system.samples(2), again.samples(2))
+    assert spin_in_a_bath(1.0).drop_baths().baths.number == 0
+    with pytest.raises(lt.InputError, match=r"no baths\. Give it baths="):
+        system.temperatures(START)
+
+
 BAD = {
     "a finite capacity": (lambda: lt.HeatBaths(2.0, lambda t: 1.0 + t), "must be infinite"),
     "a vector of temperatures": (lambda: lt.HeatBaths(np.inf, lambda t: jnp.ones(2)), "must have shape"),
