@@ -22,7 +22,7 @@ from ..systems.kinds import require_system
 from ..tracing.caching import fingerprint
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.traced import TracedFunction, trace_function
-from .named_parameters import arrays_with_members, find_parameter
+from .named_parameters import arrays_with_members, find_parameter, refused_members
 
 MAX_CHECKED_MEMBERS = 8
 """Largest number of members that are built and checked one by one at a time."""
@@ -106,7 +106,10 @@ class Family:
                     "are expected. Give the moments of each trajectory as a row, or a system with a tensor"
                 )
         arrays = arrays_with_members(system, parameters)
-        return cls(ProgramStructure.from_module(system), arrays, None if parameters else system)
+        reasons = refused_members(system, arrays)
+        return cls(
+            ProgramStructure.from_module(system), arrays, None if parameters else system, refusal_reasons=reasons
+        )
 
     @classmethod
     def from_function(cls, build: Callable, parameters) -> Family:
