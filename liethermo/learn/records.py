@@ -214,7 +214,10 @@ class _Labels:
             problem = (
                 f"the columns {', '.join(matches)} may all be times" if matches else "the data have no column 'time'"
             )
-            raise InputError(f"{problem}; their columns are {', '.join(self.names)}. Name the times with time=")
+            raise InputError(
+                f"{problem}; their columns are {', '.join(self.names)}. Name the column of the times, such as "
+                f"lt.learn.read_data(data, time={(matches or list(self.names))[0]!r})"
+            )
         return matches[0]
 
     def unit(self, label: str) -> str:

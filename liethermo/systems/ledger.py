@@ -175,9 +175,14 @@ class LedgerSystem(System):
     def temperature_at(self, y) -> jax.Array:
         """Return the temperature at y, a state without ledger, shape ()."""
 
-    def temperature(self, x) -> jax.Array:
-        """Return the temperature, ``-dL/dS``, at states, shape (...)."""
+    def temperature(self, x, t=None) -> jax.Array:
+        """Return the temperature, ``-dL/dS``, at states, shape (...); it does not depend on the time t."""
+        del t
         return jnp.vectorize(self.temperature_at, signature="(n)->()")(self.drop_ledger(x))
+
+    def temperatures(self, x, t=None) -> jax.Array:
+        """Return the temperature with an axis of length 1, shape (..., 1): see :meth:`temperature`."""
+        return self.temperature(x, t)[..., None]
 
     # -- checks -------------------------------------------------------------------------------------------------------
 
