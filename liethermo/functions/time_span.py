@@ -281,7 +281,7 @@ class PiecewiseConstant(FunctionWithBreaks):
     Parameters
     ----------
     times : sequence of float, length m
-        Increasing times of the jumps. They are no parameters of a system: they decide where steps end.
+        Increasing times of the jumps. They are not parameters of a system, because they decide where steps end.
     values : array, shape (m - 1, ...)
         The values between two of the times.
 

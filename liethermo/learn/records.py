@@ -79,7 +79,7 @@ class Records(Sequence[Trajectory], metaclass=ListedABCMeta):
         Raises
         ------
         InputError
-            If there is no column of a name.
+            If there is no column of this name.
         """
         for name in names:
             if name not in self.names:

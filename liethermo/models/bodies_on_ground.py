@@ -120,7 +120,7 @@ class BodiesOnGround(TreeSystem, TorqueSystem):
         Raises
         ------
         InputError
-            If there is no joint of a name, a shape does not fit, or a temperature is given without a bath.
+            If there is no joint of this name, a shape does not fit, or a temperature is given without a bath.
         """
         if x is not None:
             if degrees or any(value is not None for value in (joints, joint_rates, temperature)):

@@ -235,7 +235,7 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         Raises
         ------
         InputError
-            If there is no joint of a name, a shape does not fit, or a temperature is given without a bath.
+            If there is no joint of this name, a shape does not fit, or a temperature is given without a bath.
         """
         details = angular_velocity, momentum, joints, joint_rates, centre_of_mass, velocity, temperature
         if x is not None:

@@ -131,7 +131,7 @@ def read_csv(path: str | os.PathLike) -> AttitudeHistory:
     Raises
     ------
     FileError
-        If the file cannot be read, a column is missing, or its numbers are no attitudes.
+        If the file cannot be read, a column is missing, or its numbers are not attitudes.
     """
     path = Path(path)
     try:

@@ -72,7 +72,7 @@ def system_builder(build: System | Callable[[dict], System], parameters: tuple[s
     Raises
     ------
     InputError
-        If the system has no parameter of a name, or ``build`` is neither a system nor a function.
+        If the system has no parameter of this name, or ``build`` is neither a system nor a function.
     """
     if not isinstance(build, System):
         if not callable(build):

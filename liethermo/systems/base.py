@@ -371,7 +371,7 @@ def _attach_baths(system: System, baths: HeatBaths, bath_terms: tuple[Dissipatio
     if system.dissipation is not None or not bath_terms:
         system.dissipation = couple_to_baths(system.total_dissipation, body, m, baths.has_positive_temperatures, extend)
     if body.space is not None and body.space.dtype.kind == "c":
-        raise InputError(f"baths are for real spaces, and {body.space.name} is complex")
+        raise InputError(f"baths need a real space, but {body.space.name} is complex")
     system.baths, system.dim = baths, n + m
     system.space = None if body.space is None else mf.Product(body.space, mf.Euclidean(m))
     system.poisson = poisson_with_baths(body.poisson, m)

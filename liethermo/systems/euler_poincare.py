@@ -79,7 +79,8 @@ class EulerPoincareSystem(LiePoissonSystem):
     entropy, dissipation, momentum_maps, validate, group, reconstruction, torque
         As for :class:`LiePoissonSystem`; functions of mu.
     force : function from xi to a covector, optional
-        F of (3.2): conserves the energy whatever it is. For a force that raises an entropy use ``dissipation``.
+        The force F of (3.2), which conserves the energy for any function. For a force that raises an entropy use
+        ``dissipation``.
     """
 
     lagrangian: Energy

@@ -211,7 +211,7 @@ def configuration_space(contact: mf.SplitContact) -> mf.Space | None:
 
 
 def check_space(space) -> mf.Space:
-    """Return the space of positions, or raise an InputError if it is no space."""
+    """Return the space of positions, or raise an InputError if it is not a space."""
     if not isinstance(space, mf.Space):
         raise InputError(f"space must be a manifolds.Space, such as mf.Sphere(2), got {type(space).__name__}")
     return space

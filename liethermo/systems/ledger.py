@@ -154,7 +154,7 @@ class LedgerSystem(System):
         names = "(q, v, S, t)" if self.first_velocity_index else "(xi, S, t)"
         count = names.count(",") + 1
         if len(arguments) not in (count - 1, count):
-            raise InputError(f"forces and heat are functions of {names}, and {len(arguments)} arguments were given")
+            raise InputError(f"forces and heat are functions of {names}, but {len(arguments)} arguments were given")
         return arguments if len(arguments) == count else (*arguments, 0.0)
 
     def friction_at(self, arguments: tuple, T) -> jax.Array:

@@ -61,7 +61,7 @@ def read_ovf(path) -> VectorField:
     Raises
     ------
     FileError
-        If the file is no rectangular OVF file, or is damaged.
+        If the file is not a rectangular OVF file, or is damaged.
     """
     name = os.fspath(path)
     try:
@@ -210,7 +210,7 @@ def _read_data(content: bytes, start: int, kind: str, version: int, count: int, 
         try:
             numbers = np.array(words, dtype=float)
         except ValueError as error:
-            raise FileError(f"{name} has data that are no numbers: {error}") from error
+            raise FileError(f"{name} has data that are not numbers: {error}") from error
         if len(numbers) != count:
             raise FileError(f"{name} must have {count} numbers, got {len(numbers)}. The file is not complete")
         return numbers

@@ -467,7 +467,7 @@ def bloch_ball(
     """
     path = checked_figure_path(path)
     if not isinstance(system, QuantumSystem):
-        raise InputError(f"a Bloch ball shows states of an lt.QuantumSystem, not of a {type(system).__name__}")
+        raise InputError(f"a Bloch ball needs states of an lt.QuantumSystem, got {type(system).__name__}")
     vectors = np.asarray(system.bloch(states.x if isinstance(states, Solution) else states, part))
     if ax is None:
         ax = plt.figure(figsize=(4.6, 4.6), dpi=DPI, layout="constrained").add_subplot(projection="3d")
