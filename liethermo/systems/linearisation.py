@@ -114,8 +114,6 @@ def counter_components(system: System) -> np.ndarray:
 
     The motion of the other components does not depend on them, so they may grow in a steady state.
     """
-    if system.baths is None:
-        return np.zeros(0, dtype=int)
     energy = system.baths.energy
     if isinstance(energy, BathEnergy):
         is_constant = np.isinf(np.asarray(energy.capacity))
@@ -248,7 +246,7 @@ def _regular_kernel(system: System, x: np.ndarray, scale: float) -> np.ndarray |
     None if all Casimirs are known, if x lies on a leaf of lower dimension, or if the dissipation leaves the leaf.
     """
     by_form = dissipation_keeps_casimirs(system)
-    if not by_form or system.torque_laws.name or system.space is not None or system.baths is not None:
+    if not by_form or system.torque_laws.name or system.space is not None or system.baths.number:
         return None
     if system.orbit_levels.has_all_casimirs or system.dim > MAX_TENSOR_DIM:
         return None
