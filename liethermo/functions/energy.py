@@ -194,11 +194,15 @@ class Energy(Module):
 
     @with_library_settings
     def __call__(self, x, t=None) -> jax.Array:
-        x = jnp.asarray(x, dtype=jnp.float64)
+        x = self.flattened_states(jnp.asarray(x, dtype=jnp.float64))
         if t is None:
             return jnp.vectorize(self.value, signature="(n)->()")(x)
         evaluate = jnp.vectorize(lambda x, t: self.at_time(t).value(x), signature="(n),()->()")
         return evaluate(x, jnp.asarray(t, dtype=jnp.float64))
+
+    def flattened_states(self, x) -> jax.Array:
+        """Return states, shape (..., n), from states in that shape or in another one that the energy accepts."""
+        return x
 
     def __add__(self, other) -> Energy:
         return Sum((*self.terms, *make_energy(other, "a term of a sum").terms))
@@ -589,6 +593,7 @@ class Negative(Energy):
 
     couplings = forward_to("term")
     check_components = forward_to("term")
+    flattened_states = forward_to("term")
 
     def __neg__(self) -> Energy:
         return self.term
@@ -617,6 +622,7 @@ class Multiple(Energy):
 
     couplings = forward_to("term")
     check_components = forward_to("term")
+    flattened_states = forward_to("term")
 
     def multiple(self, factor) -> Energy:
         return Multiple(self.term, factor * self.factor)
@@ -652,6 +658,11 @@ class Sum(Energy):
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
         return union_pattern(term.couplings(dim) for term in self.summands)
+
+    def flattened_states(self, x) -> jax.Array:
+        for term in self.summands:
+            x = term.flattened_states(x)
+        return x
 
     def __neg__(self) -> Energy:
         return Sum(tuple(-term for term in self.summands))

@@ -284,7 +284,7 @@ class PiecewiseConstant(FunctionWithBreaks):
     Parameters
     ----------
     times : sequence of float, length m
-        Increasing times of the jumps. They are no parameters of a system: they decide where steps end.
+        Increasing times of the jumps. They are not parameters of a system, because they decide where steps end.
     values : array, shape (m - 1, ...)
         The values between two of the times.
 
@@ -305,11 +305,48 @@ class PiecewiseConstant(FunctionWithBreaks):
 
     def __init__(self, times, values):
         self.times, self.values = checked_breaks(times), checked_numbers(values, "values")
-        if self.times != tuple(np.asarray(times, dtype=np.float64)) or self.values.shape[:1] != (len(self.times) - 1,):
+        if self.times != tuple(np.asarray(times, dtype=np.float64)):
+            raise InputError("the times of PiecewiseConstant must increase. Merge pulses that begin or end together")
+        if self.values.shape[:1] != (len(self.times) - 1,):
             raise InputError(
-                "PiecewiseConstant needs increasing times and one value for each interval between two of them, got "
-                f"{len(times)} times and values of shape {self.values.shape}"
+                f"PiecewiseConstant with {len(self.times)} times needs {len(self.times) - 1} values, one for each "
+                f"interval, got values of shape {self.values.shape}. Outside of these times it is zero"
             )
+
+    @classmethod
+    def from_pulses(cls, starts, ends, values) -> PiecewiseConstant:
+        """Return the sum of rectangular pulses, which may overlap, such as the firings of thrusters.
+
+        Parameters
+        ----------
+        starts, ends : sequence of float, length m
+            Times at which each pulse starts and ends.
+        values : array, shape (m, ...)
+            The value of each pulse between these times.
+
+        Raises
+        ------
+        InputError
+            If a pulse does not end after its start, or the lengths differ.
+
+        Examples
+        --------
+        >>> levels = lt.PiecewiseConstant.from_pulses([1.0, 2.0], [3.0, 4.0], [0.5, 1.0])
+        >>> [float(levels(t)) for t in (0.0, 1.5, 2.5, 3.5, 4.5)]
+        [0.0, 0.5, 1.5, 1.0, 0.0]
+        """
+        begins, finishes = checked_numbers(starts, "starts"), checked_numbers(ends, "ends")
+        heights = checked_numbers(values, "values")
+        if begins.ndim != 1 or begins.shape != finishes.shape or heights.shape[:1] != begins.shape:
+            raise InputError(
+                f"from_pulses needs one start, one end and one value for each pulse, got the shapes {begins.shape}, "
+                f"{finishes.shape} and {heights.shape}"
+            )
+        times = np.array(checked_breaks(np.concatenate([begins, finishes])))
+        if not bool(np.all(np.asarray(finishes) > np.asarray(begins))):
+            raise InputError("each pulse must end after its start")
+        is_on = (np.asarray(begins)[:, None] <= times[:-1]) & (times[:-1] < np.asarray(finishes)[:, None])
+        return cls(times, jnp.tensordot(is_on.T.astype(float), heights, 1))
 
     @property
     def break_times(self) -> tuple[float, ...]:

@@ -195,8 +195,8 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     preserves = frozenset({"energy", "entropy_law", "casimirs"})
 
     def check(self, system: System) -> None:
-        """Raise InputError unless the system conserves the preserved functions, and these are fewer than its
-        dimensions."""
+        """Raise InputError unless the system conserves the preserved functions, which must be fewer than the
+        components of a state."""
         check_preserved(system, self.functions)
         if not self.functions:
             return

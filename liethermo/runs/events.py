@@ -299,8 +299,8 @@ def _argument_names(function: Callable) -> tuple[str, ...]:
     names = tuple(name if name in ARGUMENT_NAMES else "x" for name in required) or ("x",)
     if names.count("x") > 1:
         raise InputError(
-            f"an event function has the arguments (x) or (t, x), and any of {', '.join(ARGUMENT_NAMES)} by these "
-            f"names; got {', '.join(required)}"
+            f"an event function must have the arguments (x) or (t, x), and any of {', '.join(ARGUMENT_NAMES)} by "
+            f"these names, got {', '.join(required)}"
         )
     return names
 

@@ -76,8 +76,8 @@ def replace_parameters(system: System, values: Mapping[str, Any]) -> System:
     Raises
     ------
     InputError
-        If the system has no parameter of a name, or a value has another shape or is refused by the constructor of its
-        object, as a negative rate is.
+        If the system has no parameter of this name, or a value has another shape or is refused by the constructor of
+        its object, as a negative rate is.
     """
     # the system's own arrays, which cannot change in place, so that results for the new system can be cached
     leaves: list[Any] = jax.tree_util.tree_leaves(eqx.filter(system, eqx.is_inexact_array))
@@ -176,7 +176,7 @@ def arrays_with_members(system: System, values: Mapping[str, Any]) -> list[np.nd
     Raises
     ------
     InputError
-        If the system has no parameter of a name, or values have another shape.
+        If the system has no parameter of this name, or values have another shape.
     """
     leaves = [array[None] for array in parameter_arrays(system)]
     replaced: dict[int, str] = {}

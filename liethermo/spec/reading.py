@@ -483,7 +483,7 @@ def _parse_axis(key: str, axis: Any, problems: list[str]) -> Any:
         if isinstance(axis, EvenlySpacedAxis):
             grid_function = np.geomspace if axis.scale == "log" else np.linspace
             if axis.scale == "log" and min(axis.first, axis.last) <= 0.0:
-                raise InputError("the values of a logarithmic axis are positive")
+                raise InputError("the values of a logarithmic axis must be positive")
             return grid_function(axis.first, axis.last, axis.points)
         if not isinstance(axis, SampledAxis):
             return axis

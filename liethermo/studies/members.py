@@ -75,7 +75,7 @@ def system_builder(
     Raises
     ------
     InputError
-        If the system has no parameter of a name, or ``build`` is neither a system nor a function.
+        If the system has no parameter of this name, or ``build`` is neither a system nor a function.
     """
     if not isinstance(build, System):
         if not callable(build):

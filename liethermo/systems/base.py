@@ -159,11 +159,18 @@ class System(SystemInterface):
     def temperatures(self, x, t=None) -> jax.Array:
         """Return the temperatures of the baths, shape (..., baths), for states of shape (..., n).
 
+        With one bath, ``system.temperature(x)`` returns its temperature, shape (...).
+
         Parameters
         ----------
         x : array, shape (..., n)
         t : float or array, shape (...), optional
             The times of the states, if the temperatures depend on it.
+
+        Raises
+        ------
+        InputError
+            If there are no baths, or their temperatures depend on time and t is missing.
         """
         if not self.baths.number:
             raise InputError("this system has no baths. Give it baths=lt.HeatBaths(...)")
@@ -176,6 +183,27 @@ class System(SystemInterface):
             raise InputError("the temperatures of the baths depend on time. Give the time beside the state")
         gradient = jnp.vectorize(lambda y, t: energy.at_time(t).gradient(y), signature="(m),()->(m)")
         return gradient(entropies, jnp.asarray(t, dtype=jnp.float64))
+
+    def temperature(self, x, t=None) -> jax.Array:
+        """Return the temperature of a system with one bath, or with one temperature, shape (...).
+
+        Parameters
+        ----------
+        x : array, shape (..., n)
+        t : float or array, shape (...), optional
+            The times of the states, if the temperature depends on it.
+
+        Raises
+        ------
+        InputError
+            If the system has no temperature, or several: see :meth:`temperatures`.
+        """
+        T = self.temperatures(x, t)
+        if T.shape[-1] != 1:
+            raise InputError(
+                f"this system has {T.shape[-1]} temperatures. Use system.temperatures(x), of shape (..., {T.shape[-1]})"
+            )
+        return T[..., 0]
 
     def energy_of_vectors(self, energy: Energy) -> Energy:
         """Return a function of flat states from a function of states in the shape that users see."""
@@ -344,7 +372,7 @@ def _attach_baths(system: System, baths: HeatBaths, bath_terms: tuple[Dissipatio
     if system.dissipation is not None or not bath_terms:
         system.dissipation = couple_to_baths(system.total_dissipation, body, m, baths.has_positive_temperatures, extend)
     if body.space is not None and body.space.dtype.kind == "c":
-        raise InputError(f"baths are for real spaces, and {body.space.name} is complex")
+        raise InputError(f"baths need a real space, but {body.space.name} is complex")
     system.baths, system.dim = baths, n + m
     system.space = None if body.space is None else mf.Product(body.space, mf.Euclidean(m))
     system.poisson = poisson_with_baths(body.poisson, m)

@@ -159,6 +159,10 @@ class EvolutionSystem(MomentumContactSystem):
         """Return the temperature ``T = H_S`` of states, shape (...), at the time t if the energy depends on it."""
         return evaluate_batch(self, lambda system, y: system.energy.gradient(y)[-1], x, t, "()")
 
+    def temperatures(self, x, t=None) -> jax.Array:
+        """Return the temperature with an axis of length 1, shape (..., 1): see :meth:`temperature`."""
+        return self.temperature(x, t)[..., None]
+
 
 class ContactSystem(MomentumContactSystem):
     """The plain contact field X_H of an energy on T*Q x R, for comparison [SML §2.2].
@@ -207,7 +211,7 @@ def configuration_space(contact: mf.SplitContact) -> mf.Space | None:
 
 
 def check_space(space) -> mf.Space:
-    """Return the space of positions, or raise an InputError if it is no space."""
+    """Return the space of positions, or raise an InputError if it is not a space."""
     if not isinstance(space, mf.Space):
         raise InputError(f"space must be a manifolds.Space, such as mf.Sphere(2), got {type(space).__name__}")
     return space

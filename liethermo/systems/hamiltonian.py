@@ -98,7 +98,7 @@ def _energy_of_terms(terms: Sequence, times) -> tuple[int, Energy]:
         H, f = term if is_pair else (term, None)
         f = f if f is None or callable(f) else _coefficient_function(f, times, i)
         if isinstance(H, list | tuple) and H and _is_hamiltonian_term(H[0]):
-            raise InputError(f"term {i} of the Hamiltonian is a matrix, or a pair of a matrix and a function of t")
+            raise InputError(f"term {i} of the Hamiltonian must be a matrix, or a pair of a matrix and a function of t")
         H = checked_hermitian(H, f"term {i} of the Hamiltonian")
         if H.shape != (first_matrix := (constant + modulated + [H])[0]).shape:
             raise InputError(
@@ -138,8 +138,8 @@ def _coefficient_function(coefficient, times, i: int) -> Callable:
     values = np.asarray(coefficient)
     if values.dtype.kind not in "fiu" or values.ndim != 1:
         raise InputError(
-            f"term {i} of the Hamiltonian is a matrix, or a pair of a matrix and a function of t, or of a matrix and "
-            f"an array of real numbers; its second entry is of type {type(coefficient).__name__}"
+            f"term {i} of the Hamiltonian must be a matrix, or a pair of a matrix and a function of t or an array of "
+            f"real numbers, got a second entry of type {type(coefficient).__name__}"
         )
     if times is None:
         raise InputError(f"the coefficient of term {i} of the Hamiltonian is an array, so it needs times=")

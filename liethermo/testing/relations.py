@@ -128,7 +128,7 @@ def why_not_linear_states(case: RelationCase) -> SkipReason:
     """Return why linear maps of the states do not apply to a case, as a text, or None if they do."""
     system = case.system
     if system.is_driven or system.space is not None or system.sites:
-        return "states are no vectors of R^n whose functions depend on them alone"
+        return "states are not vectors of R^n whose functions depend on them alone"
     return None
 
 

@@ -376,8 +376,8 @@ def fields_from_equations(function: Callable, n: int, name: str) -> dict[str, An
         residual = np.abs(np.asarray(ravel_pytree(function(jnp.asarray(matrix)))[0])).max()
         if not residual <= EXPONENTIAL_TOLERANCE * max(1.0, scale):
             raise ClosureError(
-                f"the solutions of f are no group: exponentials of its algebra miss them by {residual:.3g} (tolerance "
-                f"{EXPONENTIAL_TOLERANCE * max(1.0, scale):.0e}); add the equations that are missing",
+                f"the solutions of f are not a group: exponentials of its algebra miss them by {residual:.3g} "
+                f"(tolerance {EXPONENTIAL_TOLERANCE * max(1.0, scale):.0e}). Add the equations that are missing",
                 residual=float(residual),
                 tolerance=EXPONENTIAL_TOLERANCE * max(1.0, scale),
             )

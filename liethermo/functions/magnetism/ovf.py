@@ -61,7 +61,7 @@ def read_ovf(path) -> VectorField:
     Raises
     ------
     FileError
-        If the file is no rectangular OVF file, or is damaged.
+        If the file is not a rectangular OVF file, or is damaged.
     """
     name = os.fspath(path)
     try:
@@ -215,7 +215,7 @@ def _read_data(
         try:
             numbers = np.array(words, dtype=float)
         except ValueError as error:
-            raise FileError(f"{file_name} has data that are no numbers: {error}") from error
+            raise FileError(f"{file_name} has data that are not numbers: {error}") from error
         if len(numbers) != n_numbers:
             raise FileError(f"{file_name} must have {n_numbers} numbers, got {len(numbers)}. The file is not complete")
         return numbers

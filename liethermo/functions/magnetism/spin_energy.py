@@ -67,6 +67,9 @@ class SpinEnergy(Energy):
     def check_components(self, dim: int, role: str) -> None:
         check_spin_count(self.sites, dim, role)
 
+    def flattened_states(self, x) -> jax.Array:
+        return flattened_spins(x, self.sites)
+
 
 def lattice_spins(x, sites: tuple[int, ...], planar: bool = False) -> VectorComponents:
     """Return the components of the spins of a state, each of the shape of the sites."""
@@ -87,6 +90,22 @@ def lattice_shape(sites) -> tuple[int, ...]:
     if not shape or not is_valid:
         raise InputError(f"sites must be a positive integer, or a tuple for a lattice such as (64, 64), got {sites!r}")
     return tuple(int(n) for n in shape)
+
+
+def flattened_spins(x, sites: tuple[int, ...]) -> jax.Array:
+    """Return states, shape (..., n), from such states or from spins, shape ``(..., *sites, 3)``.
+
+    Raises
+    ------
+    InputError
+        If the shape is neither.
+    """
+    n, shape = 3 * math.prod(sites), (*sites, 3)
+    if x.shape[-1:] >= (n,):
+        return x
+    if x.shape[-len(shape) :] != shape:
+        raise InputError(f"spins must have shape (..., {', '.join(map(str, shape))}) or (..., {n}), got {x.shape}")
+    return x.reshape(*x.shape[: -len(shape)], n)
 
 
 def check_spin_count(sites: tuple[int, ...], dim: int, role: str) -> None:

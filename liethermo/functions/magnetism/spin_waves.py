@@ -56,7 +56,7 @@ def spin_wave_frequencies(
     Raises
     ------
     InputError
-        If the state is no state of rest, or does not repeat.
+        If the state is not at rest, or does not repeat.
 
     Examples
     --------

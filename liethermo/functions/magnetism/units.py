@@ -187,4 +187,4 @@ def units(name: str = "meV") -> Units:
         )
     if name == "reduced":
         return Units("reduced", "energy", "time", "length", 1.0, 1.0, 1.0, 1.0)
-    raise InputError(f'the units of magnets are "SI", "meV" or "reduced", got {name!r}')
+    raise InputError(f'the units of magnets must be "SI", "meV" or "reduced", got {name!r}')

@@ -413,7 +413,7 @@ def test_unusable_files(tmp_path, text, options, words):
 def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(lt.FileError, match="there is no file"):
         lt.read_graph(tmp_path / "none.csv")
-    with pytest.raises(lt.FileError, match=r"neither .csv nor .graphml"):
+    with pytest.raises(lt.FileError, match=r"must be .csv or .graphml, got"):
         lt.read_graph(write_file(tmp_path, CSV, "graph.txt"))
     (tmp_path / "binary.csv").write_bytes(b"source,target,conductance\n\xff\xfe,1,2\n")
     with pytest.raises(lt.FileError, match="cannot be read as CSV"):

@@ -449,8 +449,8 @@ def test_operators_of_other_libraries_are_read_by_their_matrices():
 BAD = {
     "term 1 of the Hamiltonian is not Hermitian": lambda q: lt.QuantumSystem([QUBIT, (LOWER, jnp.cos)]),
     "term 1 of the Hamiltonian has shape": lambda q: lt.QuantumSystem([QUBIT, (np.eye(3), jnp.cos)]),
-    "term 1 of the Hamiltonian is a matrix, or a pair": lambda q: lt.QuantumSystem([QUBIT, (X, 0.5)]),
-    "term 0 of the Hamiltonian is a matrix, or a pair": lambda q: lt.QuantumSystem([[X, 0.5], QUBIT]),
+    "term 1 of the Hamiltonian must be a matrix, or a pair": lambda q: lt.QuantumSystem([QUBIT, (X, 0.5)]),
+    "term 0 of the Hamiltonian must be a matrix, or a pair": lambda q: lt.QuantumSystem([[X, 0.5], QUBIT]),
     "of term 1 of the Hamiltonian must return a real number": lambda q: lt.QuantumSystem(
         [QUBIT, (X, lambda t: 1j * t)]
     ),
