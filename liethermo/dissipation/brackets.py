@@ -106,6 +106,7 @@ class DoubleBracket(Damping):
 
 
 def _checked_metric(metric) -> Any:
+    """Return a metric, a matrix or the diagonal of one, as a linear map; raise InputError unless it is semidefinite."""
     if np.ndim(metric) != 1:
         return checked_semidefinite(metric, "the metric")
     entries = checked_numbers(metric, "the metric")
@@ -375,6 +376,7 @@ class KulkarniNomizu(Dissipation):
 
 
 def _check_semidefinite_on_pairs(form) -> None:
+    """Raise IndefiniteError if the form of a 4-bracket on pairs of covectors has a negative eigenvalue."""
     if isinstance(form, jax.core.Tracer):
         return
     min_eigenvalue, scale = float(np.linalg.eigvalsh(np.asarray(form))[0]), float(np.abs(form).max())
@@ -388,6 +390,7 @@ def _check_semidefinite_on_pairs(form) -> None:
 
 
 def _check_curvature_symmetries(R) -> None:
+    """Raise InputError unless R has the symmetries of an algebraic curvature tensor."""
     if isinstance(R, jax.core.Tracer):
         return
     R = np.asarray(R)

@@ -188,6 +188,7 @@ def _couple_term_to_baths(
     has_positive_temperatures: bool,
     pullback: Callable[[Energy], Energy],
 ) -> Dissipation:
+    """Return one summand of a body's dissipation in the system with baths; it heats a bath if it lowers the energy."""
     functions = tuple(map(pullback, term.preserve))
     if term.energy_law != "nonincreasing":
         return HeatlessDissipation(term, functions)
