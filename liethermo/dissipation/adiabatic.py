@@ -108,7 +108,7 @@ class AdiabaticJumps(ThermalJumps):
 
     def bind_to(self, system):
         structure = self._checked_structure(system)
-        if system.baths is None:
+        if not system.baths.number:
             raise InputError("AdiabaticJumps exchange heat with a bath. Give the system baths=lt.HeatBaths(...)")
         body_energy = system.energy.body if isinstance(system.energy, BodyBathsEnergy) else system.energy
         if is_traced(body_energy):

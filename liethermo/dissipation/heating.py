@@ -243,7 +243,7 @@ class BathConduction(HeatConduction):
         super().__init__(graph_edges(conductance, n_baths, "the conductance", names))
 
     def bind_to(self, system):
-        n_baths = 0 if system.baths is None else system.baths.number
+        n_baths = system.baths.number
         last = int(np.max(np.asarray(self.second_bodies), initial=0))
         if last >= n_baths:
             raise InputError(

@@ -149,7 +149,7 @@ class ThermalJumps(Dissipation):
                 "system for each Hamiltonian, as lt.Study does. Rates, temperatures and capacities may be traced"
             )
         hamiltonians = system.hamiltonians()
-        if baths is None:
+        if not baths.number:
             jumps = tuple(Jump(V, i, 0.5 if is_hermitian(V) else 1.0) for i, V in enumerate(self.operators))
             conserves_energy = all(is_commuting(H, V) for H in hamiltonians for V in map(np.asarray, self.operators))
             return replace_fields(
@@ -184,7 +184,7 @@ class ThermalJumps(Dissipation):
                     f"the coupling V[{i}] has shape {np.shape(V)}, but the Hamiltonian has shape ({structure.size}, "
                     f"{structure.size})"
                 )
-        if baths is not None and self.bath >= baths.number:
+        if 0 < baths.number <= self.bath:
             raise InputError(
                 f"{name} exchange heat with bath {self.bath}, but there are {baths.number} baths, numbered from 0"
             )

@@ -23,7 +23,7 @@ from ..matrices.linear import (
 )
 from ..matrices.spectral import spectral
 from ..matrices.symmetric import eigh, orthonormal_columns, polar, symmetrize
-from .base import CUT_MARGIN, Space, register
+from .base import CUT_MARGIN, MIN_CUT_ANGLE, Space, register
 from .maps import inner_by_flat, squared_distance_with_cut_locus
 
 _MAX_NEWTON_STEPS = 30
@@ -425,7 +425,7 @@ def _angle_over_sine(half_angle_sine_squared):
     sine_squared = jnp.where(
         use_series,
         0.25,
-        jnp.where(half_angle_sine_squared < 0.5 - 0.5 * (math.pi / 2 * CUT_MARGIN), half_angle_sine_squared, jnp.nan),
+        jnp.where(half_angle_sine_squared < 0.5 - 0.5 * MIN_CUT_ANGLE, half_angle_sine_squared, jnp.nan),
     )
     cosine_squared = 1.0 - sine_squared
     return jnp.where(
