@@ -177,7 +177,7 @@ class InnerProductDissipation(BracketDissipation):
         return self.K @ bracket_dH_dS
 
     def factor(self, system, x, dH, dL):
-        return _bracket_factor(system, dH, self.K)
+        return _bracket_dissipation_factor(system, dH, self.K)
 
 
 class KillingDissipation(BracketDissipation):
@@ -245,11 +245,11 @@ class KillingDissipation(BracketDissipation):
         return self.rate * (self.form @ bracket_dH_dS)
 
     def factor(self, system, x, dH, dL):
-        factor = _bracket_factor(system, dH, self.form)
+        factor = _bracket_dissipation_factor(system, dH, self.form)
         return None if factor is None else factor.scale_by(self.rate)
 
 
-def _bracket_factor(system, dH, form) -> Factor | None:
+def _bracket_dissipation_factor(system, dH, form) -> Factor | None:
     """Return the factor of ``ad*_dH 𝒦 ad_dH``, whose columns have divergence zero; None if 𝒦 has no known root.
 
     C is skew in a, b: ``div ad*_dH F = C[a, b, c] H_ab F_c`` vanishes.

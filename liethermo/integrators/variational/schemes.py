@@ -168,11 +168,11 @@ class VariationalIntegrator(OneStepMethod):
                 f"retraction= needs a manifold of positions, and this {system.kind} has none. Leave retraction= out"
             )
         elif isinstance(system, ComposedSystem):
-            self._check_maps_for_bodies(system)
+            self._check_maps_for_composed_system(system)
         else:
             require_simple_closed(system, "VariationalIntegrator")
 
-    def _check_maps_for_bodies(self, system: ComposedSystem) -> None:
+    def _check_maps_for_composed_system(self, system: ComposedSystem) -> None:
         if not (self.phi == self.forces == self.constraint):
             raise InputError(f"for several bodies the maps of forces and constraint must be phi, and {self} has others")
         if any(type(map) is not FiniteDifference for map in self.phi):
