@@ -255,16 +255,20 @@ class GeomstatsSpace(Space):
     ) -> list[np.ndarray]:
         """Return the arguments with the k-th displaced: a point along a geodesic, with its tangent vectors projected
         there."""
-        kinds, displaced = _KERNEL_SIGNATURES[kernel][0], list(arrays)
+        kinds, displaced_arguments = _KERNEL_SIGNATURES[kernel][0], list(arrays)
         if kinds[argument_index] != "p":
-            displaced[argument_index] = displaced[argument_index] + displacement
-            return displaced
-        displaced[argument_index] = self._evaluate_on_host("exp", displaced[argument_index], displacement)
+            displaced_arguments[argument_index] = displaced_arguments[argument_index] + displacement
+            return displaced_arguments
+        displaced_arguments[argument_index] = self._evaluate_on_host(
+            "exp", displaced_arguments[argument_index], displacement
+        )
         if argument_index == 0:
             tangent_indices = [i for i, kind in enumerate(kinds) if kind == "v"]
             for i in tangent_indices:
-                displaced[i] = self._evaluate_on_host("project_tangent", displaced[0], displaced[i])
-        return displaced
+                displaced_arguments[i] = self._evaluate_on_host(
+                    "project_tangent", displaced_arguments[0], displaced_arguments[i]
+                )
+        return displaced_arguments
 
 
 # -- kernels of geomstats, on arrays of shape (count, *shape) -----------------------------------------------------
