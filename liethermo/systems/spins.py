@@ -232,7 +232,7 @@ class SpinSystem(TorqueSystem):
         turning_rate = float((np.hypot(np.ravel(spins.ratio), damping_rate) * field).max())
         diffusion = 0.0
         if boltzmann and parts is not None and parts.heating is not None:
-            temperature = np.asarray(parts.heating.values_at_sites(gradient[n:]))
+            temperature = np.asarray(parts.heating.bath_values_at_sites(gradient[n:]))
             diffusion = float((2.0 * boltzmann * np.abs(temperature) * rate).max())
         if not (turning_rate > 0.0 or diffusion > 0.0):
             raise InputError("no spin turns at this state, so any step will do. Give a state away from rest")
