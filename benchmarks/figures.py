@@ -60,7 +60,7 @@ def draw_time_ratios(themes: dict[str, list[PeerComparison]], path: Path) -> Non
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    tasks_by_theme = {theme: list(dict.fromkeys(c.work for c in found)) for theme, found in themes.items()}
+    tasks_by_theme = {theme: list(dict.fromkeys(c.work for c in comparisons)) for theme, comparisons in themes.items()}
     n_lines = sum(len(tasks) + 1 for tasks in tasks_by_theme.values())
     with matplotlib.rc_context({"svg.hashsalt": "liethermo", "svg.fonttype": "none", "font.size": 9}):
         figure, axes = plt.subplots(figsize=(4.2, 1.0 + 0.33 * n_lines), layout="constrained")

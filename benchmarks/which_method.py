@@ -93,7 +93,7 @@ METHODS = (
 
 
 def measure_methods(problem: Problem) -> dict[str, list[tuple[float, float]]]:
-    """Return points (error, evaluations) for each method; steps that fail from some state are left out."""
+    """Return points (error, evaluations) for each method, without step sizes that fail."""
     system, span = problem.build_system(), (0.0, problem.t_end)
     states = np.array(problem.initial_state) * (
         1.0 + 0.1 * np.random.default_rng(0).standard_normal((N_RUNS, system.dim))

@@ -10,7 +10,7 @@ import numpy as np
 import liethermo as lt
 from liethermo.functions.magnetism.transitions import autocorrelation_time
 
-from ..heat_bath import sample_heat_bath
+from ..heat_bath import simulate_heisenberg_heat_bath
 from ..report import Report, Table, Target
 
 CRITICAL_TEMPERATURE = 1.4429
@@ -45,7 +45,7 @@ MIN_CROSSING_BLOCKS = 20
 
 @dataclass(frozen=True)
 class Series:
-    """Energy per spin and magnetisation vector along a run in equilibrium, shape (n, 4)."""
+    """Time series of energy per spin and magnetisation vector of a run in equilibrium, shape (n, 4)."""
 
     generator: str
     length: int
@@ -78,7 +78,7 @@ class Series:
 
     @property
     def row_indices(self) -> np.ndarray:
-        """Indices of all rows."""
+        """Indices of all rows of the samples."""
         return np.arange(len(self.samples))
 
     def drop_transient(self) -> Series:
@@ -161,7 +161,7 @@ def run(is_quick: bool) -> Report:
         ]
     temperatures = sorted([CRITICAL_TEMPERATURE, *STEP_SHARE_BY_TEMPERATURE])
     for length, sweeps in ({4: 200} if is_quick else SWEEPS_BY_LENGTH).items():
-        chains = sample_heat_bath(length, temperatures, sweeps)
+        chains = simulate_heisenberg_heat_bath(length, temperatures, sweeps)
         runs += [
             [Series(MONTE_CARLO_ROW, length, T, sweeps, 1, rows)] for T, rows in zip(temperatures, chains, strict=True)
         ]

@@ -62,11 +62,11 @@ def jump_operators(levels: int) -> list[np.ndarray]:
 
 def exact_states(levels: int, rho: np.ndarray) -> np.ndarray:
     """Return the density matrices at the early time and at the end."""
-    H, one = operators(levels)[0], np.eye(levels)
-    generator = -1j * (np.kron(H, one) - np.kron(one, H.T))
+    H, identity = operators(levels)[0], np.eye(levels)
+    generator = -1j * (np.kron(H, identity) - np.kron(identity, H.T))
     for L in jump_operators(levels):
         n = L.T @ L
-        generator += np.kron(L, L.conj()) - 0.5 * (np.kron(n, one) + np.kron(one, n.T))
+        generator += np.kron(L, L.conj()) - 0.5 * (np.kron(n, identity) + np.kron(identity, n.T))
     return np.stack([scipy.linalg.expm(generator * t) @ rho.ravel() for t in (EARLY_TIME, T_END)]).reshape(
         2, levels, levels
     )

@@ -37,7 +37,7 @@ N_CLUSTER_BODIES = 200_000
 def run(is_quick: bool) -> Report:
     """Measure a large study, small chunks, and a cluster."""
     bodies, chunks, n_cluster_bodies = (2_000, 100, 500) if is_quick else (N_BODIES, N_CHUNKS, N_CLUSTER_BODIES)
-    single_results = [process.run_child("studies", what, str(bodies)) for what in ("bare", "kept")]
+    single_results = [process.run_in_child_process("studies", part_name, str(bodies)) for part_name in ("bare", "kept")]
     overhead = single_results[1]["seconds"] / single_results[0]["seconds"] - 1.0
     columns = {"": "text", "Time": "seconds", "Peak memory": "gigabytes"}
     rows = [
@@ -45,7 +45,7 @@ def run(is_quick: bool) -> Report:
         for name, a in zip(("`ensemble(until=lt.Relaxed(...))`", "`Study`, kept"), single_results, strict=True)
     ]
     time_table = Table(f"The relaxation times of {bodies:,} bodies, each in a process of its own.", columns, rows)
-    chunk_result = process.run_child("studies", "chunks", str(chunks))
+    chunk_result = process.run_in_child_process("studies", "chunks", str(chunks))
     columns = {"Chunks": "count", "Time": "seconds", "A chunk": "seconds"}
     chunk_table = Table(
         "Chunks of one point with one step: what a chunk costs.",
@@ -54,7 +54,7 @@ def run(is_quick: bool) -> Report:
     )
     rows, one_worker_seconds = [], None
     for workers in (1, 2, 4):
-        result = process.run_child("studies", "workers", str(n_cluster_bodies), str(workers))
+        result = process.run_in_child_process("studies", "workers", str(n_cluster_bodies), str(workers))
         one_worker_seconds = one_worker_seconds or result["seconds"]
         rows.append([workers, result["seconds"], one_worker_seconds / result["seconds"]])
     columns = {"Workers": "count", "Time": "seconds", "Speed-up": "ratio"}

@@ -249,8 +249,8 @@ def differentiable_stepper(
             "fit do not end. Use functions of time that are continuous"
         )
     prepared_system, method = prepare_for_method(system, method, None, has_attitude)
-    inner = method.method if isinstance(method, WithAttitude) else method
-    needs_no_compensation = isinstance(inner, MetriplecticRungeKutta) and prepared_system.surface is None
+    base_method = method.method if isinstance(method, WithAttitude) else method
+    needs_no_compensation = isinstance(base_method, MetriplecticRungeKutta) and prepared_system.surface is None
 
     def step(carry, h):
         if needs_no_compensation:

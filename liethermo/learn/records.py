@@ -392,10 +392,10 @@ def _read_csv(path: Path):
         with path.open(encoding="utf-8-sig") as file:
             header = next((line for line in file if line.strip() and not line.startswith("#")), "")
         separator = max(SEPARATORS, key=header.count)
-        how = {"sep": separator, "comment": "#", "skipinitialspace": True, "encoding": "utf-8-sig"}
-        frame = pandas.read_csv(path, **how)
+        read_options = {"sep": separator, "comment": "#", "skipinitialspace": True, "encoding": "utf-8-sig"}
+        frame = pandas.read_csv(path, **read_options)
         if separator != "," and any(map(pandas.api.types.is_string_dtype, frame.dtypes)):  # 1,5 in place of 1.5
-            frame = pandas.read_csv(path, decimal=",", **how)
+            frame = pandas.read_csv(path, decimal=",", **read_options)
     except FileNotFoundError:
         raise FileError(f"there is no file {path!s:.200}") from None
     except (OSError, UnicodeDecodeError, ValueError) as error:  # errors of the parser of pandas are ValueErrors

@@ -159,8 +159,8 @@ def can_refine_by_least_squares(
     )
 
 
-def _is_perceptron(part: Any) -> bool:
-    return isinstance(part, Perceptron)
+def _is_perceptron(node: Any) -> bool:
+    return isinstance(node, Perceptron)
 
 
 def pad_runs(trajectories: list[Trajectory], states: list[np.ndarray]) -> PaddedRuns:
@@ -392,8 +392,8 @@ def refine_by_least_squares(
     schur, slope = _schur_complement(
         _add_initial_state_prior(matrices, n_weights, variance), gradients, n_weights, is_training
     )
-    total = costs[is_training].sum()
-    variance = total / degrees_of_freedom if degrees_of_freedom > 0 else np.nan
+    total_cost = costs[is_training].sum()
+    variance = total_cost / degrees_of_freedom if degrees_of_freedom > 0 else np.nan
     inverse, _, condition = _inverse_rank_and_condition(schur)
     weight_diagonal = np.diag(matrices[is_training].sum(axis=0))[:n_weights]  # with the first states known
     without_prior, rank, _ = _inverse_rank_and_condition(
@@ -405,7 +405,7 @@ def refine_by_least_squares(
     if not is_training.all() and equations.is_finite[~is_training].all():
         held_out_freedom = _degrees_of_freedom(n_observations, matrices[:, n_weights:, n_weights:], ~is_training, 0)
         held_out_residual = np.sqrt(costs[~is_training].sum() / held_out_freedom) if held_out_freedom > 0 else np.nan
-    gradient = 2.0 * float(np.linalg.norm(slope)) / total if total > 0.0 else 0.0
+    gradient = 2.0 * float(np.linalg.norm(slope)) / total_cost if total_cost > 0.0 else 0.0
     with np.errstate(invalid="ignore"):
         covariance = inverse * variance
     is_training_run = ~np.asarray(is_held_out)

@@ -375,8 +375,8 @@ class TrainingRun:
         InputError
             If the loss is not finite.
         """
-        total = sum(phase.steps for phase in self.phases)
-        with Progress((0, total), progress, "step {:.0f}") as progress_bar:
+        n_steps = sum(phase.steps for phase in self.phases)
+        with Progress((0, n_steps), progress, "step {:.0f}") as progress_bar:
             while self.phase_index < len(self.phases):
                 phase = self.phases[self.phase_index]
                 try:
@@ -593,15 +593,15 @@ def read_archive(path: Path, file_format: str) -> tuple[dict[str, Any], dict[str
 
 
 def _checksum(metadata: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:
-    parts = [
-        part for name in sorted(arrays) for part in (name, arrays[name].dtype.str, arrays[name].shape, arrays[name])
+    values = [
+        value for name in sorted(arrays) for value in (name, arrays[name].dtype.str, arrays[name].shape, arrays[name])
     ]
-    return fingerprint(json.dumps(metadata, sort_keys=True), *parts)
+    return fingerprint(json.dumps(metadata, sort_keys=True), *values)
 
 
 def fingerprint(*values: Any) -> str:
     """Return the SHA-256 of arrays and of the texts of other objects, as hexadecimal."""
     digest = hashlib.sha256()
-    for part in values:
-        digest.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
+    for value in values:
+        digest.update(np.ascontiguousarray(value).tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
     return digest.hexdigest()
