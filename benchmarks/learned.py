@@ -107,7 +107,11 @@ def _forecast_errors(states: np.ndarray, exact_states: np.ndarray) -> list[float
     """Return the mean squares and mean magnitudes of forecast errors, within the training time and after it."""
     half = (exact_states.shape[1] + 1) // 2
     error_parts = [states[:, :half] - exact_states[:, :half], states[:, half:] - exact_states[:, half:]]
-    return [float(f(errors)) for f in (lambda e: np.mean(e**2), lambda e: np.mean(np.abs(e))) for errors in error_parts]
+    return [
+        float(average(errors))
+        for average in (lambda e: np.mean(e**2), lambda e: np.mean(np.abs(e)))
+        for errors in error_parts
+    ]
 
 
 def _law_errors(energy: np.ndarray, entropy: np.ndarray, energy_spread: float) -> list[float]:

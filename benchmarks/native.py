@@ -197,8 +197,8 @@ class HeunProgram:
     def __init__(self, edge: int, exchange: float, axis: float, rate: float):
         self._library, self._parameters = compile_library("heun.c"), (exchange, axis, rate)
         index = np.arange(edge**3, dtype=np.int32).reshape(edge, edge, edge)
-        shifted = [np.roll(index, shift, axis=a) for a in range(3) for shift in (1, -1)]
-        self._neighbours = np.ascontiguousarray(np.stack(shifted, axis=-1).reshape(-1, len(shifted)))
+        shifted_indices = [np.roll(index, shift, axis=a) for a in range(3) for shift in (1, -1)]
+        self._neighbours = np.ascontiguousarray(np.stack(shifted_indices, axis=-1).reshape(-1, len(shifted_indices)))
 
     def integrate(self, spins, step: float, steps: int, temperature: float = 0.0) -> np.ndarray:
         """Return the spins, shape (count, 3), after ``steps`` steps in a bath of this temperature."""

@@ -93,8 +93,8 @@ def write_pages(results: Path, page: Path, runs: Path = RUNS_FILE) -> None:
     machines, differing = _machine_section(result_files)
     parts = [RUNS_INTRODUCTION, machines, _target_section(targets)]
     for name, report in reports.items():
-        on_a_page = name in first_page.LEARNING_MEASUREMENTS
-        parts.append(f"## {report.title}\n\nOn the page of learned systems." if on_a_page else report.markdown())
+        has_its_page = name in first_page.LEARNING_MEASUREMENTS
+        parts.append(f"## {report.title}\n\nOn the page of learned systems." if has_its_page else report.markdown())
         if name in differing:
             parts.append(f"Measured elsewhere: {differing[name]}.")
         if report.series:

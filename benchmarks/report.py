@@ -105,13 +105,13 @@ def targets_table(targets: Sequence[Target]) -> Table:
 
 def build_available(builders: Mapping[Any, Callable[[], Any]]) -> tuple[dict[Any, Any], dict[Any, str]]:
     """Call builders by name; return the results, and the reasons of those that raise :class:`UnavailableError`."""
-    works, skipped = {}, {}
+    works, skip_reasons = {}, {}
     for name, build in builders.items():
         try:
             works[name] = build()
         except UnavailableError as reason:
-            skipped[name] = str(reason)
-    return works, skipped
+            skip_reasons[name] = str(reason)
+    return works, skip_reasons
 
 
 def ratio(a: float | None, b: float | None) -> float | None:

@@ -77,7 +77,7 @@ def _repeat_and_time(work) -> tuple[tuple[float, float], float]:
     seconds = processor = float("inf")
     total = 0.0
     while total < MIN_TURN_SECONDS:
-        timed = time_once(work)
-        seconds, processor = min(seconds, timed.wall_seconds), min(processor, timed.cpu_seconds)
-        total += timed.wall_seconds
+        timed_result = time_once(work)
+        seconds, processor = min(seconds, timed_result.wall_seconds), min(processor, timed_result.cpu_seconds)
+        total += timed_result.wall_seconds
     return (seconds, processor), total

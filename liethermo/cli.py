@@ -54,7 +54,7 @@ def _print_version(is_requested: bool) -> None:
 
 
 @app.callback()
-def _options(
+def _top_level_options(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Say the version and exit.")
     ] = False,

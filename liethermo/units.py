@@ -138,7 +138,7 @@ def parse_unit(name: str) -> Unit:
             raise InputError(f"unknown unit {name!r}. {_known_units_text(name)}")
         while position < len(product_text):
             match = FACTOR_PATTERN.match(product_text, position)
-            if match is None or (unit := _simple_unit(match[1])) is None:
+            if match is None or (unit := _find_unit_without_exponent(match[1])) is None:
                 raise InputError(f"unknown unit {name!r}. {_known_units_text(match[1] if match else name)}")
             power = int(match[2] or 1) * (1 if i == 0 else -1)
             factor *= unit[0] ** power
@@ -168,23 +168,23 @@ def quantity_in_si(text: str) -> float:
     return float(match[1]) * parse_unit(match[2]).factor
 
 
-def _simple_unit(name: str) -> tuple[float, dict[str, int]] | None:
-    """Return the factor and the exponents of a unit without exponent; None if it is not known."""
+def _find_unit_without_exponent(name: str) -> tuple[float, dict[str, int]] | None:
+    """Return the SI factor and the dimension exponents of a unit name without exponent; None if it is unknown."""
     name = SYNONYMS.get(name, name)
     if len(name) >= MIN_WORD_LENGTH and name.lower() != name:  # RPM and Kelvin
-        lower_case_unit = _simple_unit(name.lower())
-        if name not in OTHER_UNITS and lower_case_unit is not None and _prefixed_unit(name) is None:
+        lower_case_unit = _find_unit_without_exponent(name.lower())
+        if name not in OTHER_UNITS and lower_case_unit is not None and _find_prefixed_unit(name) is None:
             return lower_case_unit
     if name in OTHER_UNITS:
         return OTHER_UNITS[name]
     if "/" in name:
         unit = parse_unit(name)
         return unit.factor, dict(unit.dimension)
-    return _prefixed_unit(name)
+    return _find_prefixed_unit(name)
 
 
-def _prefixed_unit(name: str) -> tuple[float, dict[str, int]] | None:
-    """Return the factor and the exponents of an SI unit with a prefix; None if it is not known."""
+def _find_prefixed_unit(name: str) -> tuple[float, dict[str, int]] | None:
+    """Return the SI factor and the dimension exponents of a unit name with an SI prefix; None if it is unknown."""
     for prefix, factor in PREFIXES.items():
         if name.startswith(prefix) and (exponents := SI_UNITS.get(name[len(prefix) :])) is not None:
             return factor * (1e-3 if name.endswith("g") else 1.0), exponents

@@ -164,9 +164,9 @@ def dipole_table(edges) -> Table:
         for borders, is_periodic in (("open", False), ("periodic", True)):
             lattice = lt.magnetism.lattice("sc", (edge,) * 3, periodic=is_periodic)
             exchange = lt.magnetism.exchange(lattice, EXCHANGE)
-            both = exchange + lt.magnetism.dipoles(lattice, 1.0, DIPOLE_STRENGTH)
+            exchange_and_dipoles = exchange + lt.magnetism.dipoles(lattice, 1.0, DIPOLE_STRENGTH)
             works = {}
-            for name, energy in (("without", exchange), ("with", both)):
+            for name, energy in (("without", exchange), ("with", exchange_and_dipoles)):
                 system = lt.SpinSystem(lattice, energy, lt.LandauLifshitz(RATE))
                 x0 = system.state(spins)
                 works[name] = functools.partial(library_run, system, x0, method=METHODS["explicit 4"])
@@ -181,7 +181,7 @@ def dipole_table(edges) -> Table:
 def seconds_per_step(works: dict, steps: int) -> dict[str, float]:
     """Return the processor seconds of a step of each work, a function of ``steps``, without the call itself."""
     runs = {(name, n): functools.partial(work, steps=n) for name, work in works.items() for n in (SHORT_STEPS, steps)}
-    seconds = {run: timed.cpu_seconds for run, timed in race(runs, rounds=CUBE_ROUNDS).items()}
+    seconds = {run: timed_result.cpu_seconds for run, timed_result in race(runs, rounds=CUBE_ROUNDS).items()}
     return {name: (seconds[name, steps] - seconds[name, SHORT_STEPS]) / (steps - SHORT_STEPS) for name in works}
 
 

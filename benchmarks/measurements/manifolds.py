@@ -150,7 +150,7 @@ def child(number: str, way: str, steps: str) -> dict[str, list]:
         return results
     euclidean = mf.Euclidean(space.dim)
     euclidean_system, start = relaxing(euclidean), np.asarray(euclidean.random(3))
-    exact = _exact_end(system, x0)
+    exact = _exact_final_state(system, x0)
     for name, method in methods.items():
         euclidean_seconds = _step_seconds(euclidean_system, start, METHODS[name]) if name == "RK4" else None
         results[name] += [_step_seconds(system, x0, method), euclidean_seconds]
@@ -187,7 +187,7 @@ def _step_seconds(system: lt.MetriplecticSystem, x0, method, steps: int = 20_000
     return best_seconds / steps
 
 
-def _exact_end(system: lt.MetriplecticSystem, x0) -> np.ndarray:
+def _exact_final_state(system: lt.MetriplecticSystem, x0) -> np.ndarray:
     field = jax.jit(lambda x: system.vector_field(x))
     exact = solve_ivp(lambda t, x: np.asarray(field(x)), (0.0, 1.0), x0, method="DOP853", rtol=1e-13, atol=1e-14)
     return exact.y[:, -1]

@@ -187,8 +187,8 @@ def _to_ode_result(
     stats, status = solution.stats, SCIPY_STATUS.get(str(solution.status.code), -1)
     iterations = stats.fixed_point_iterations + stats.newton_iterations
 
-    def sol(saved_times):
-        return np.moveaxis(solution(saved_times), -1, 0)
+    def sol(t):
+        return np.moveaxis(solution(t), -1, 0)
 
     events = solution.events or [None] * len(has_initial_event)
     no_events = np.empty(0), np.empty((0, *solution.x.shape[1:]))

@@ -60,8 +60,10 @@ def parameter_vector(system: System, also: Callable | None = None, positive: Cal
     for choose in (also, positive):
         if choose is not None:
             mask = eqx.tree_at(choose, mask, replace_fn=lambda part: jax.tree_util.tree_map(lambda _: True, part))
-    no_mask = jax.tree_util.tree_map(lambda _: False, mask)
-    positive_mask = no_mask if positive is None else eqx.tree_at(positive, no_mask, replace_fn=lambda _: True)
+    all_false_mask = jax.tree_util.tree_map(lambda _: False, mask)
+    positive_mask = (
+        all_false_mask if positive is None else eqx.tree_at(positive, all_false_mask, replace_fn=lambda _: True)
+    )
     learned_part, fixed_part = eqx.partition(system, mask)
     logs, values = eqx.partition(learned_part, positive_mask)
     logs_and_values = jax.tree_util.tree_map(jnp.log, logs), values

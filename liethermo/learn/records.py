@@ -65,8 +65,8 @@ class Records(Sequence[Trajectory], metaclass=ListedABCMeta):
     def __str__(self) -> str:
         n_rows = sum(len(t) for t, _ in self.trajectories)
         start, end = min(t[0] for t, _ in self.trajectories), max(t[-1] for t, _ in self.trajectories)
-        missing = sum(int(np.isnan(x).sum()) for _, x in self.trajectories)
-        missing_text = f", {missing} values missing" if missing else ""
+        n_missing = sum(int(np.isnan(x).sum()) for _, x in self.trajectories)
+        missing_text = f", {n_missing} values missing" if n_missing else ""
         plural = "y" if len(self) == 1 else "ies"
         return (
             f"{', '.join(self.names)}: {n_rows} rows in {len(self)} trajector{plural}, times {start:.4g} to {end:.4g}"

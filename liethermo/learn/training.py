@@ -269,15 +269,15 @@ class Training(metaclass=ListedType):
                 "with other initial values, or give more iterations, as shooting=2000. If a positive parameter "
                 "tends to 0, leave it out of the fit"
             )
-        undetermined = [
+        undetermined_parameters = [
             f"{name} = {value:.3g} ± {error:.2g}"
             for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True)
             if np.isinf(error) or (value > 0.0 and error > MAX_RELATIVE_STANDARD_ERROR * value)
         ]
-        if undetermined:
+        if undetermined_parameters:
             messages.append(
-                f"the data do not determine {', '.join(undetermined)}. Give more data, or leave known numbers out of "
-                "the fit"
+                f"the data do not determine {', '.join(undetermined_parameters)}. Give more data, or leave "
+                "known numbers out of the fit"
             )
         max_residual = MAX_RESIDUAL_TO_NOISE
         if self.noise.size and self.noise_is_estimated:  # two standard errors above the noise that was estimated
@@ -342,8 +342,8 @@ class Training(metaclass=ListedType):
 
 def training_without_descent(n_parameters: int, seconds: float) -> Training:
     """Return an empty record, for a fit by least squares alone."""
-    no_values = np.zeros(0)
-    return Training(np.zeros(0, int), np.zeros(0, str), no_values, no_values, n_parameters, seconds)
+    empty_array = np.zeros(0)
+    return Training(np.zeros(0, int), np.zeros(0, str), empty_array, empty_array, n_parameters, seconds)
 
 
 class TrainingRun:

@@ -148,11 +148,11 @@ class ArticulatedBodies(Module):
     @property
     def _path_matrix(self) -> np.ndarray:
         """Boolean matrix, shape (k + 1, k), that is True if joint j is on the path from the base to link i."""
-        moved_by = np.zeros((self.n_joints + 1, self.n_joints), bool)
+        is_on_path = np.zeros((self.n_joints + 1, self.n_joints), bool)
         for i, parent in enumerate(self.parents):
-            moved_by[i + 1] = moved_by[parent]
-            moved_by[i + 1, i] = True
-        return moved_by
+            is_on_path[i + 1] = is_on_path[parent]
+            is_on_path[i + 1, i] = True
+        return is_on_path
 
     @property
     def _bodies_moved_by_link(self) -> np.ndarray:
@@ -251,8 +251,8 @@ class ArticulatedBodies(Module):
         T is the kinetic energy, and J the trace of the locked inertia about the origin of the base. The terms of a tree
         without angular momentum cancel.
         """
-        locked = jnp.trace(self.composite_inertias(self.poses(q)).rotational[0])
-        return jnp.sqrt(2.0 * self.kinetic_energy(Pi, q, p) * locked)
+        locked_inertia = jnp.trace(self.composite_inertias(self.poses(q)).rotational[0])
+        return jnp.sqrt(2.0 * self.kinetic_energy(Pi, q, p) * locked_inertia)
 
     def articulated_joint_inertias(self, q) -> jax.Array:
         """Return the articulated-body inertia of each joint, shape (k,): what it moves if the joints beyond are

@@ -113,8 +113,8 @@ def warn_of_impossible_moments(moments: np.ndarray) -> None:
 
 def is_slender_rod(moments: np.ndarray) -> bool:
     """Return True if moments of inertia, shape (3,), are those of a slender rod: one is zero, the others are equal."""
-    least, middle, greatest = np.sort(moments).tolist()
-    return abs(least) <= ROD_RTOL * greatest and greatest - middle <= EQUAL_MOMENTS_RTOL * greatest
+    min_moment, median_moment, max_moment = np.sort(moments).tolist()
+    return abs(min_moment) <= ROD_RTOL * max_moment and max_moment - median_moment <= EQUAL_MOMENTS_RTOL * max_moment
 
 
 def _are_positive(moments):

@@ -125,8 +125,8 @@ class TreeSystem(System):
     @with_library_settings
     def _motion(self, x) -> Motion:
         x = self.state(x, batch=True)
-        flat = _motions(self.mechanism, x.reshape(-1, self.dim))
-        return Motion(*(array.reshape(*x.shape[:-1], *array.shape[1:]) for array in flat))
+        flat_motion = _motions(self.mechanism, x.reshape(-1, self.dim))
+        return Motion(*(array.reshape(*x.shape[:-1], *array.shape[1:]) for array in flat_motion))
 
     def _joint_vector_from_names(self, values: Mapping[str, Any] | None, argument_name: str) -> jax.Array:
         """Return coordinates or rates of all joints, shape (k,) or (B, k), from values by body name; others are 0."""

@@ -133,14 +133,14 @@ class DipoleField(Module):
         self.rotation = checked_finite(rotation, "rotation", 3)
 
     def __call__(self, t) -> jax.Array:
-        r, k = self.orbit(t), rotate(self.strength, self.rotation * t)
+        r, k = self.orbit(t), rotate_by_vector(self.strength, self.rotation * t)
         r_squared = jnp.dot(r, r)
         return (3.0 * jnp.dot(k, r) / r_squared * r - k) / (r_squared * jnp.sqrt(r_squared))
 
 
-def rotate(vector, angle) -> jax.Array:
-    """Return a vector rotated by a rotation vector, shape (3,), whose derivatives exist at zero."""
-    return mf.SO(3).exp(angle) @ vector
+def rotate_by_vector(vector, rotation_vector) -> jax.Array:
+    """Rotate a vector, shape (3,), by a rotation vector; derivatives by the rotation vector exist at zero."""
+    return mf.SO(3).exp(rotation_vector) @ vector
 
 
 def checked_eccentricity(value) -> jax.Array:

@@ -146,8 +146,8 @@ class Tree(metaclass=ListedType):
             raise InputError(f"{name!r} is the first body, so it is the base, which has no parent and no joint")
         if self._bodies:
             if parent is None or joint is None:
-                missing = "a parent" if parent is None else "a joint"
-                raise InputError(f"{name!r} needs {missing}: only the base, {self.base!r}, has none")
+                missing_argument = "a parent" if parent is None else "a joint"
+                raise InputError(f"{name!r} needs {missing_argument}: only the base, {self.base!r}, has none")
             if parent not in self._bodies:
                 names = ", ".join(map(repr, self._bodies))
                 raise InputError(

@@ -158,11 +158,11 @@ def mechanical_and_body_problems() -> dict[str, Problem]:
 
 def density_matrix_problems() -> dict[str, Problem]:
     """Return two test problems of open quantum systems, by name: three levels with two jumps, and a driven qubit."""
-    lower, sx = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0, 1.0], [1.0, 0.0]])
+    lowering_operator, sx = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0, 1.0], [1.0, 0.0]])
     H = np.array([[0.0, 0.3, 0.1j], [0.3, 0.8, 0.2], [-0.1j, 0.2, 1.5]])
     levels = QuantumSystem(H, LindbladJumps([(np.eye(3, k=1), 0.4), (np.diag([0.0, 1.0, -1.0]), 0.2)]))
     drive = [np.diag([0.0, 1.0]), [sx, lambda t: 0.6 * jnp.cos(1.3 * t)]]
-    qubit = QuantumSystem(drive, LindbladJumps([(lower, lambda t: 0.3 + 0.2 * jnp.sin(t))]))
+    qubit = QuantumSystem(drive, LindbladJumps([(lowering_operator, lambda t: 0.3 + 0.2 * jnp.sin(t))]))
     return {
         "three levels": (levels, levels.state(np.diag([0.2, 0.3, 0.5])), 2.0),
         "driven qubit": (qubit, qubit.state([1.0, 0.0]), 2.0),
@@ -277,21 +277,27 @@ def check_dissipation(dissipation: Dissipation | System, algebra: mf.LieAlgebra 
     suite = Suite(f"{type(system.dissipation).__name__} in a {system.kind}")
     random = np.random.default_rng(seed)
     points = [x for x in system.samples(8, seed) if np.isfinite(np.asarray(system.vector_field(x))).all()]
-    tested, max_energy_rate, min_entropy_rate, max_force = system.dissipation, 0.0, 0.0, 0.0
+    tested_dissipation, max_energy_rate, min_entropy_rate, max_force = system.dissipation, 0.0, 0.0, 0.0
     for x in points:
-        dH, dS, *dL = random.standard_normal((2 + len(tested.preserve), system.dim))
+        dH, dS, *dL = random.standard_normal((2 + len(tested_dissipation.preserve), system.dim))
         if system.baths.has_positive_temperatures:
             dH[system.body_dim :] = np.abs(dH[system.body_dim :])  # no gradient has temperatures below zero
         force = np.asarray(
-            tested.force(system, jnp.asarray(x), jnp.asarray(dH), jnp.asarray(dS), tuple(map(jnp.asarray, dL)))
+            tested_dissipation.force(
+                system, jnp.asarray(x), jnp.asarray(dH), jnp.asarray(dS), tuple(map(jnp.asarray, dL))
+            )
         )
         scale = float(np.linalg.norm(force))
         max_energy_rate = max(max_energy_rate, float(abs(force @ dH) / max(scale * np.linalg.norm(dH), 1e-300)))
         min_entropy_rate = min(min_entropy_rate, float((force @ dS) / max(scale * np.linalg.norm(dS), 1e-300)))
         max_force = max(max_force, scale)
-    if tested.energy_law == "conserved" and system.space is None:
+    if tested_dissipation.energy_law == "conserved" and system.space is None:
         suite.check_small("any vector instead of grad H is in the kernel", max_energy_rate, 1.0, 1e-12)
-    if tested.entropy_law == "nondecreasing" and tested.energy_law == "conserved" and system.space is None:
+    if (
+        tested_dissipation.entropy_law == "nondecreasing"
+        and tested_dissipation.energy_law == "conserved"
+        and system.space is None
+    ):
         suite.check_small("the entropy cannot fall, whatever the vectors", min(min_entropy_rate, 0.0), 1.0, 1e-12)
     suite.check_true("it acts", max_force > 0.0)
     suite.rows += system.check(seed=seed).rows

@@ -193,15 +193,19 @@ def hide_parameters_in_closures(energy: Energy) -> Energy:
 def replace_system_attributes(system: System, **attributes: Any) -> System:
     """Return a copy of a system with some attributes replaced, such as ``energy``."""
     names = list(attributes)
-    changed = eqx.tree_at(
+    changed_system = eqx.tree_at(
         lambda s: [getattr(s, name) for name in names],
         system,
         list(attributes.values()),
         is_leaf=lambda part: part is None,
     )
     if "dissipation" in attributes:  # the constructor sets these names from the dissipation
-        object.__setattr__(changed, "preserved_labels", find_preserved_names(changed) if changed.preserved else None)
-    return changed
+        object.__setattr__(
+            changed_system,
+            "preserved_labels",
+            find_preserved_names(changed_system) if changed_system.preserved else None,
+        )
+    return changed_system
 
 
 # -- other dissipations ---------------------------------------------------------------------------------------------

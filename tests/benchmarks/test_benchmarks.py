@@ -122,7 +122,7 @@ def test_the_statistics_of_the_magnet():
     time = _series(np.column_stack([x, np.sqrt(x - x.min()), np.zeros((n, 2))])).autocorrelation_time  # of m²
     assert abs(time / ((1 + rho) / (2 * (1 - rho))) - 1.0) < 0.2  # 0.06 is its standard error
     rows = np.column_stack([x, x, np.zeros((n, 2))])
-    mean, error = magnet.with_error(lambda s, row_indices: s.energy[row_indices].mean(), _series(rows))
+    mean, error = magnet.value_and_jackknife_error(lambda s, row_indices: s.energy[row_indices].mean(), _series(rows))
     assert 0.5 < error / np.sqrt(2 * time / n) < 1.5
     assert abs(mean) < 4 * error
 
