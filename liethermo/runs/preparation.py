@@ -215,7 +215,7 @@ def limit_to_span(system: System, schedule: StepSchedule) -> System:
     At the breaks within the span functions of time may jump. Equal arguments return the same object, so that cached
     results are shared.
     """
-    span = schedule.start, schedule.end, *schedule.breaks
+    span = *schedule.function_span, *schedule.breaks
     if not is_driven_run(system):
         return system
     if is_traced(system):
@@ -227,7 +227,7 @@ def limit_to_span(system: System, schedule: StepSchedule) -> System:
 
 def limit_family_to_span(family: Family, system: System, schedule: StepSchedule) -> Family:
     """Return the family with each member limited to the span of a schedule; ``system`` is one of the members."""
-    span = schedule.start, schedule.end, *schedule.breaks
+    span = *schedule.function_span, *schedule.breaks
     return family.map_members_with_shared_numbers(set_time_span, *span) if is_driven_run(system) else family
 
 

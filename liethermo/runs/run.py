@@ -316,7 +316,7 @@ class Run:
                 engine=None if isinstance(self.method, Reference) else self.engine.name,
                 noise=None if noise is None else noise.to_provenance(),
                 x0=x0.tolist() if self.system.dim <= MAX_PROVENANCE_COMPONENTS else None,
-                **({"breaks": list(schedule.breaks)} if schedule.breaks else {}),
+                **({"breaks": list(schedule.all_breaks)} if schedule.all_breaks else {}),
             )
         )
 

@@ -13,7 +13,7 @@ import numpy as np
 from ..engines.array_engine import MAX_SAVES_PER_CALL
 from ..errors import InputError
 from ..functions.gradients import EPS
-from ..functions.time_span import TIMES_OF_SMOOTH_FUNCTIONS, DeclaredTimes, checked_breaks
+from ..functions.time_span import BREAK_RTOL, TIMES_OF_SMOOTH_FUNCTIONS, DeclaredTimes, checked_breaks
 from .adaptive import Adaptive
 
 CHUNK_STEPS = 100_000
@@ -86,12 +86,16 @@ class StepSchedule:
     allow_infinite_end : bool
         Allow an infinite end, for adaptive steps.
     breaks : sequence of float
-        Increasing times inside the span at which functions of time jump: steps end there too.
+        Increasing times at which functions of time jump: steps end at those inside the span too.
 
     Attributes
     ----------
     start, end, h : float
     breaks : tuple of float
+        The breaks inside the span.
+    function_span : (float, float)
+        First and last time at which functions of time are evaluated: the span, but from after a break at its start,
+        and from before a break at its end, by a rounding error.
     segments : list of ScheduleSegment
         One for each stop: each time to save, and each break.
     n_steps : int
@@ -119,8 +123,16 @@ class StepSchedule:
         ):
             raise InputError(f"save_every must be a positive integer, got {save_every!r}")
         saved_stops = {self.end} if save_at is None else {float(t) for t in save_at if t > self.start}
-        stops = sorted({*saved_stops, *breaks})
-        self.save_every, self.breaks = save_every, tuple(breaks)
+        rounding = BREAK_RTOL * max(abs(self.start), abs(self.end) if math.isfinite(self.end) else 0.0)
+        inner_start, inner_end = self.start + rounding, self.end - rounding
+        self.function_span = (
+            inner_start if any(abs(t - self.start) <= rounding for t in breaks) else self.start,
+            inner_end if any(abs(t - self.end) <= rounding for t in breaks) else self.end,
+        )
+        self.all_breaks = tuple(breaks)
+        self.breaks = tuple(t for t in breaks if inner_start < t < inner_end)
+        stops = sorted({*saved_stops, *self.breaks})
+        self.save_every = save_every
         self.segments = [
             ScheduleSegment.from_span(*ends, self.h, save_every is not None or ends[1] in saved_stops)
             for ends in itertools.pairwise([self.start, *stops])
@@ -132,7 +144,8 @@ class StepSchedule:
         """Return the schedule of a span of length zero at time t; it has no step."""
         schedule = cls.__new__(cls)
         schedule.start = schedule.end = t
-        schedule.h, schedule.save_every, schedule.segments, schedule.n_steps, schedule.breaks = 0.0, None, [], 0, ()
+        schedule.h, schedule.save_every, schedule.segments, schedule.n_steps = 0.0, None, [], 0
+        schedule.breaks, schedule.all_breaks, schedule.function_span = (), (), (t, t)
         return schedule
 
     def with_more_breaks(self, breaks: Sequence[float]) -> StepSchedule:
@@ -140,7 +153,7 @@ class StepSchedule:
         if not breaks:
             return self
         save_at = self.saved_stop_times if self.save_every is None else None
-        all_breaks = sorted({*self.breaks, *breaks})
+        all_breaks = sorted({*self.all_breaks, *breaks})
         return StepSchedule((self.start, self.end), self.h, self.save_every, save_at, breaks=all_breaks)
 
     def ends_step_at(self, t: float) -> bool:
@@ -295,14 +308,14 @@ def make_schedule(
         kinks = []
     kinks = kinks if len(kinks) <= MAX_KINKS else []
     all_breaks = {*(checked_breaks(breaks) if np.size(breaks) else ()), *declared.jumps, *kinks}
-    breaks_inside = tuple(sorted(t for t in all_breaks if start < t < end))
+    breaks_in_span = tuple(sorted(t for t in all_breaks if start <= t <= end))
     schedule = StepSchedule(
-        (start, end), step_size, save_every, allow_infinite_end=allow_infinite_end, breaks=breaks_inside
+        (start, end), step_size, save_every, allow_infinite_end=allow_infinite_end, breaks=breaks_in_span
     )
     if save_at is None:
         return schedule
-    save_times = _save_times(save_at, start, end, breaks_inside)
-    return StepSchedule((start, end), step_size, None, save_times, allow_infinite_end, breaks_inside)
+    save_times = _save_times(save_at, start, end, schedule.breaks)
+    return StepSchedule((start, end), step_size, None, save_times, allow_infinite_end, breaks_in_span)
 
 
 def refuse_unknown_times(start: float, end: float, known_span: tuple[float, float]) -> None:

@@ -226,8 +226,9 @@ def _compile(function: Callable, arguments: tuple, options: dict | None) -> Call
 
     The cache is found by the text of the program, so it never returns the program of another function. The text has
     all arguments, also those that the program does not use: without them, programs that use different ones of their
-    arguments, or have unused arguments of different shapes, would have the same text. Programs that call Python, or that run on accelerators or on several devices, are not cached, nor any if JAX's own cache is on:
-    a program that comes from there cannot be written again.
+    arguments, or have unused arguments of different shapes, would have the same text. Programs that call Python, or
+    that run on accelerators or on several devices, are not cached, nor any if JAX's own cache is on: a program that
+    comes from there cannot be written again.
     """
     devices = jax.devices()
     is_cpu = devices[0].platform == "cpu"

@@ -176,6 +176,68 @@ def test_jump_of_the_energy_is_work(switched_reference, method, step, max_error,
     assert np.ptp(solution.energy - solution.casimirs["work"]) < (1e-11 if isinstance(method, lt.Reference) else 1e-14)
 
 
+# -- breaks at the ends of a span ---------------------------------------------------------------------------------
+
+
+def switched_energy(is_right_continuous):
+    def energy(m, t):
+        is_on = (t >= 1.0) & (t < 3.0) if is_right_continuous else (t > 1.0) & (t <= 3.0)
+        return tilted_energy(jnp.where(is_on, 2.0, 0.0))(m)
+
+    return damped_body(energy)
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("is_right_continuous", [True, False])
+@pytest.mark.parametrize(
+    ("method", "step", "max_error"),
+    [
+        pytest.param(lt.Reference(1e-12), 0.1, 1e-11, id="SciPy"),
+        pytest.param(lt.MetriplecticRungeKutta(8), lt.Adaptive(1e-10), 2e-9, id="RK8"),
+        pytest.param(lt.MetriplecticTaylor(), lt.Adaptive(1e-10), 2e-9, id="Taylor"),
+        pytest.param(lt.MetriplecticGauss(3), 0.025, 1e-8, id="Gauss"),
+    ],
+)
+def test_a_run_in_parts_that_end_at_the_switches(switched_reference, method, step, max_error, is_right_continuous):
+    """A part ends with the energy from before a switch, and the next one starts with the energy from after it."""
+    system, m, parts = switched_energy(is_right_continuous), X0, []
+    for span in ((0.0, 1.0), (1.0, 3.0), (3.0, 5.0)):
+        part = lt.integrate(system, m, span, step, method, breaks=[1.0, 3.0])
+        assert part.audit().passed
+        if not isinstance(method, lt.Reference):
+            assert np.abs(part.casimirs["work"]).max() < 1e-14
+            assert np.diff(part.t).min() > 1e-4
+        m, parts = part.x[-1], [*parts, part]
+    assert np.abs(m - switched_reference[0]).max() < max_error
+    jumps = [after.energy[0] - before.energy[-1] for before, after in itertools.pairwise(parts)]
+    assert abs(sum(jumps) - switched_reference[1]) < max_error
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize(("method", "step", "max_error"), METHODS, ids=str)
+def test_pulses_that_start_and_end_with_the_span(body, method, step, max_error):
+    """One step too many, such as those that shrink towards the end, would be seen in the sizes of the steps."""
+    m = X0
+    for start, end in ((2.0, 2.5), (2.5, 7.0), (7.0, 9.0)):
+        torque = thruster_at(0.5 * (start + end))
+        m = solve_ivp(
+            lambda t, m, u=torque: np.cross(m, m / INERTIA) + u, (start, end), m, "DOP853", rtol=1e-13, atol=1e-14
+        ).y[:, -1]
+    solution = lt.integrate(body, X0, (2.0, 9.0), step, method)
+    assert np.abs(solution.x[-1] - m).max() < max_error
+    assert np.diff(solution.t).min() > 1e-4
+    many = lt.ensemble(body, [X0, X0], (2.0, 9.0), step, method) if not isinstance(method, lt.Reference) else None
+    assert many is None or np.array_equal(many.x, [solution.x[-1]] * 2)
+
+
+def test_a_break_within_rounding_of_an_end_is_at_the_end(body):
+    whole = lt.integrate(body, X0, (2.0, 9.0), 0.1, lt.MetriplecticRungeKutta(8))
+    breaks = [np.nextafter(2.0, 3.0), np.nextafter(9.0, 0.0)]
+    again = lt.integrate(body, X0, (2.0, 9.0), 0.1, lt.MetriplecticRungeKutta(8), breaks=breaks)
+    assert np.array_equal(again.t, whole.t)
+    assert np.abs(again.x - whole.x).max() < 1e-14
+
+
 @pytest.mark.slow
 def test_energy_states_its_breaks(switched_reference):
     def drive(m, t):
