@@ -230,7 +230,9 @@ class PointSolver:
         n_half = len(indices) // 2
         halves = indices[:n_half], indices[n_half:]
         return [
-            part for half in halves for part in self._solve_or_bisect(points, x0s, attitudes, half, failure_messages)
+            indices_and_ensemble
+            for half in halves
+            for indices_and_ensemble in self._solve_or_bisect(points, x0s, attitudes, half, failure_messages)
         ]
 
     def _run_ensemble(self, points, x0s, attitudes, indices: np.ndarray) -> tuple[Any, np.ndarray, Ensemble]:
