@@ -14,14 +14,8 @@ from ..engines.step import REPORTED_FIELDS
 from ..engines.step_control import StepControl
 from ..systems import System
 from .driver import drive_adaptive
-from .ensemble_lanes import (
-    ARRAY_BATCH_SIZE,
-    RECORDED_INITIAL_FIELDS,
-    LaneParameters,
-    ProgressCounter,
-    padded_member_indices,
-    run_in_threads,
-)
+from .ensemble_lanes import ARRAY_BATCH_SIZE, RECORDED_INITIAL_FIELDS, ProgressCounter, run_in_threads
+from .lanes import LaneParameters, padded_member_indices
 from .record import GroupRecord
 
 ATTEMPTS_PER_CALL_RANGE = (16, 2048)

@@ -22,7 +22,7 @@ from ..systems.rotations import attitude_array
 from ..tracing.scalarize import UnsupportedPrimitive
 from .adaptive import Adaptive, make_step_control
 from .adaptive_ensemble import AdaptiveEnsembleRun
-from .ensemble_lanes import MAX_THREADS, FixedEnsembleRun, ProgressCounter, replay_steps
+from .ensemble_lanes import MAX_THREADS, FixedEnsembleRun, ProgressCounter
 from .events import EventSet, Until
 from .member_groups import common_inertia, group_members_by_invariants, members_outside_domain
 from .noise import Fluctuations, NoisePaths, check_noise
@@ -178,7 +178,7 @@ def ensemble(
             if group_record.is_interrupted:
                 break
             n_done += len(group_record.numbers)
-    return record.to_ensemble(replay_steps, reasons, provenance, wall_time=time.perf_counter() - start_time)
+    return record.to_ensemble(reasons, provenance, wall_time=time.perf_counter() - start_time)
 
 
 def _update_progress(bar: Progress, n_done: int, n_more: float) -> None:

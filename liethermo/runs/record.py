@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -14,47 +14,32 @@ from ..engines.select_engine import EngineWithFallback
 from ..engines.status_codes import StatusCode
 from ..engines.step import energy_or_entropy_that_relaxes
 from ..engines.step_control import StepControl
-from ..integrators.fluctuating import noise_dimension
-from ..results.audit_evidence import (
-    MAX_LOCAL_ERROR_STEPS,
-    MAX_SENSITIVITY_STATES,
-    MIN_MOTION_FRACTION,
-    MIN_RELATIVE_MOTION,
-    SMALLEST_NORMAL,
-    Evidence,
-    column_maxima,
-    evenly_spaced_indices,
-    largest_and_evenly_spaced,
-    largest_drifts,
-    merge_evidence,
-    n_replayed_steps,
-    rounding_scales,
-    select_worst_steps,
-)
+from ..results.audit_evidence import merge_evidence
 from ..results.ensemble import Ensemble
 from ..results.events import Events
-from ..results.rounding_scale import InvariantDrift, RoundingScale
+from ..results.rounding_scale import RoundingScale
 from ..results.solution import Solution
 from ..results.status import Laws
-from ..results.step_sampling import MAX_SAMPLED_VALUES, REPLAY_COST_RATIO, StepSample
+from ..results.step_sampling import vector_field
 from ..systems import AttitudeSystem, System
 from ..systems.attitude import driven_system_or_none
-from ..systems.conditions import RunCondition, worst_conditions
 from ..systems.states import reshape_to_sites
-from ..tracing.interpret import evaluate_at_points
 from .events import EventSet, collect_events
+from .evidence import (
+    MAX_LOCAL_ERROR_STEPS,
+    MAX_SENSITIVITY_STATES,
+    EngineReplay,
+    GroupEvidence,
+    LaneReplay,
+    evenly_spaced_indices,
+    largest_and_evenly_spaced,
+)
 from .noise import NoisePaths
 from .preparation import invariants_and_laws
 from .problem import Problem
 from .schedule import StepSchedule
-from .solution_builder import (
-    EngineReplay,
-    RecordedFunctions,
-    build_solution,
-    series_of_functions,
-    velocities_at_states,
-)
-from .system_family import Family, member_rounding_scales, vector_fields_of_members
+from .solution_builder import RecordedFunctions, build_solution, velocities_at_states
+from .system_family import Family
 from .termination import ensemble_failure_message
 
 RECORDED_QUANTITIES = (
@@ -66,9 +51,6 @@ RECORDED_QUANTITIES = (
 
 FAILURE_CODES = (StatusCode.NOT_CONVERGED, StatusCode.NON_FINITE, StatusCode.STEP_UNDERFLOW, StatusCode.STEP_LIMIT)
 """Status codes of failed trajectories."""
-
-MAX_REPLAYED_STEPS = 256
-"""Largest number of steps of a trajectory that an audit replays on the array engine, whose steps are slow."""
 
 MAX_EXPLAINED_FAILURES = 1_000
 """Largest number of failed trajectories that are checked for unbounded growth."""
@@ -155,15 +137,11 @@ class EnsembleRecord:
         self.events: list[EventOccurrence] = []
         self.groups = [GroupRecord(self, group) for group in groups]
 
-    def to_ensemble(
-        self, replay: Callable, reasons: Mapping[int, str], provenance: Mapping[str, Any], **fields: Any
-    ) -> Ensemble:
+    def to_ensemble(self, reasons: Mapping[int, str], provenance: Mapping[str, Any], **fields: Any) -> Ensemble:
         """Return the recorded trajectories as an :class:`Ensemble`, with further fields of it.
 
         Parameters
         ----------
-        replay : function of (engine, family, method, x, h, steps)
-            As :func:`.ensemble_lanes.replay_steps`.
         reasons : mapping from int to str
             Why trajectories are inadmissible.
         provenance : mapping
@@ -189,6 +167,7 @@ class EnsembleRecord:
             if self.trajectories is not None:
                 work = np.asarray(self.driven.work(x))
             x, x0, energy = None if x is None else x[..., :-2], x0[..., :-2], energy + work
+        sources = [group.evidence_source() for group in self.groups]
         engine, events = " and ".join(sorted({group.engine for group in self.groups} - {""})), self.groups[0].events
         result = Ensemble(
             t=t,
@@ -208,22 +187,13 @@ class EnsembleRecord:
             events=Events() if events is None else collect_events(self.member, events.names, self.events),
             reasons={**reasons, **self.failure_reasons},
             provenance={**provenance, "engine": engine},
-            evidence_source=self._evidence_source(replay),
+            evidence_source=functools.cache(lambda: merge_evidence([source() for source in sources])),
             velocity_sources=self._velocity_getters_by_name(),
             solution_builder=self._build_solution,
             **quantities,
             **fields,
         )
         return reshape_to_sites(self.member, result)
-
-    def _evidence_source(self, replay: Callable) -> Callable[[], Evidence] | None:
-        """Return the function that computes the evidence for an audit, or None: short steps with noise show only it."""
-        if noise_dimension(self.groups[0].method):
-            return None
-        collectors = [
-            EnsembleEvidenceCollector(group, functools.partial(replay, group.engine)) for group in self.groups
-        ]
-        return lambda: merge_evidence([collect() for collect in collectors])
 
     def _velocity_getters_by_name(self) -> dict[str, Callable[[], np.ndarray]]:
         """Return functions that compute the velocities of all trajectories, by the names of the velocities."""
@@ -384,14 +354,47 @@ class GroupRecord:
         if not len(failed_rows):
             return
         member_indices = np.arange(len(self.x0))[members][failed_rows]
-        parameters = self.family.select(member_indices).parameter_matrix(slice(None), len(member_indices))
-        velocities = vector_fields_of_members(
-            (self.family.form, parameters.shape[1]), np.concatenate([parameters, x[failed_rows]], axis=1)
-        )
+        with np.errstate(all="ignore"):
+            velocities = np.asarray(self.family.evaluate(vector_field, member_indices, x[failed_rows]))
         for i, j, velocity in zip(failed_rows, member_indices, velocities, strict=True):
             t = float(end_time[i])
             if text := ensemble_failure_message(x[i], self.x0[j], velocity, t - self.schedule.start, t, self.h):
                 self.record.failure_reasons[int(self.numbers[j])] = text
+
+    def evidence_source(self) -> GroupEvidence:
+        """Return the function that computes the evidence for an audit, of a sample of the trajectories.
+
+        Half of them are those that took most iterations, half are evenly spaced.
+        """
+        n_steps = self.record.steps[self.numbers]
+        effort = self.record.iterations[self.numbers] / np.fmax(n_steps, 1)
+        sample = largest_and_evenly_spaced(effort, MAX_LOCAL_ERROR_STEPS)
+        n_equal_steps = 1 if np.isnan(self.h) else self.schedule.segments[0].n_full_steps
+        return GroupEvidence(
+            self.member,
+            LaneReplay(self.engine, self.family.select(sample), self.method),
+            np.ascontiguousarray(self.x0[sample]),
+            self.schedule.start,
+            self.quantity("first_step", sample),
+            np.fmin(n_steps[sample], max(1, n_equal_steps)),
+            self.quantity("distance", sample),
+            *self.sampled_states(sample),
+        )
+
+    def sampled_states(self, sample: np.ndarray) -> tuple[Sequence[np.ndarray] | np.ndarray, np.ndarray]:
+        """Return saved states of these trajectories, shape (sample, times, n), at times spread over the run.
+
+        Both are empty if the run keeps no states.
+        """
+        record, rows = self.record, self.numbers[sample]
+        if record.trajectories is not None:
+            times = evenly_spaced_indices(record.trajectories.shape[1], MAX_SENSITIVITY_STATES)
+            return record.trajectories[rows][:, times, :-2], record.saved_times[times]
+        if record.x is None:
+            return (), np.zeros(0)
+        states = np.stack([record.x0[rows], record.x[rows]], axis=1)
+        end = np.nanmax(record.quantities["end_time"])
+        return states, np.linspace(record.start, end, MAX_SENSITIVITY_STATES)
 
     def velocities(self, name: str) -> np.ndarray:
         """Return the velocities of a name at the recorded states of the group, trajectories first."""
@@ -437,148 +440,6 @@ class GroupRecord:
         )
         inertia = None if system.inertia is None else system.inertia.tolist()
         return replace(solution, provenance={**member_solution.provenance, "inertia": inertia})
-
-
-class EnsembleEvidenceCollector:
-    """Computes local errors and rounding scales of an ensemble when it is called.
-
-    A sample of trajectories is replayed from the start: half of them are those that took most iterations, half are
-    evenly spaced. Their worst steps are compared with substeps.
-
-    Parameters
-    ----------
-    group : GroupRecord
-    replay : function of (family, method, x, h, steps)
-        :func:`.ensemble_lanes.replay_steps` on an engine.
-    """
-
-    def __init__(self, group: GroupRecord, replay: Callable):
-        schedule, n_steps = group.schedule, group.record.steps[group.numbers]
-        effort = group.record.iterations[group.numbers] / np.fmax(n_steps, 1)
-        sample = largest_and_evenly_spaced(effort, MAX_LOCAL_ERROR_STEPS)
-        self.family, self.member, self.method = group.family.select(sample), group.member, group.method
-        self.x, self.distance = np.ascontiguousarray(group.x0[sample]), group.quantity("distance", sample)
-        self.h, self.start_time, self.replay = group.quantity("first_step", sample), schedule.start, replay
-        self.n_steps_taken = n_steps[sample]
-        self.saved_states, self.saved_times = _sampled_saved_states(group.record, group.numbers[sample])
-        n_equal_steps = 1 if np.isnan(group.h) else schedule.segments[0].n_full_steps
-        if group.engine != "compiled":
-            n_equal_steps = min(n_equal_steps, MAX_REPLAYED_STEPS)
-        self.max_replayed_steps = max(1, min(n_equal_steps, MAX_SAMPLED_VALUES // (REPLAY_COST_RATIO * self.x.size)))
-
-    @np.errstate(over="ignore", invalid="ignore")  # overflowed states have the status non_finite
-    def __call__(self) -> Evidence:
-        form, n_members = self.family.form, len(self.x)
-        parameters = self.family.parameter_matrix(slice(None), n_members)
-        evidence = Evidence(
-            terms=self._rounding_scales(parameters), conditions=self._conditions(), drifts=self._drifts()
-        )
-        final, states = self.replay(self.family, self.method, self.x, self.h, self.max_replayed_steps)
-        member_of_step, step_number = np.nonzero(
-            np.arange(self.max_replayed_steps) < np.fmin(final["step"], self.n_steps_taken)[:, None]
-        )
-        if not len(member_of_step):
-            return evidence
-        path = np.concatenate([self.x[:, None], states], axis=1)
-        steps = StepSample(
-            self.start_time + step_number * self.h[member_of_step],
-            self.h[member_of_step],
-            path[member_of_step, step_number],
-            path[member_of_step, step_number + 1],
-        )
-        model, min_motion = (form, parameters.shape[1]), MIN_MOTION_FRACTION * self.distance
-
-        def field(step_indices: np.ndarray, x: np.ndarray) -> np.ndarray:
-            step_parameters = np.broadcast_to(
-                parameters[member_of_step[step_indices], None], (*x.shape[:2], parameters.shape[1])
-            )
-            rows = np.concatenate([step_parameters, x], axis=2).reshape(-1, parameters.shape[1] + x.shape[2])
-            return vector_fields_of_members(model, rows).reshape(x.shape)
-
-        worst_indices, defect = select_worst_steps(
-            steps, field, min_motion[member_of_step], n_replayed_steps(self.x.shape[1])
-        )
-        members, x, h = (
-            self.family.select(member_of_step[worst_indices]),
-            steps.x[worst_indices],
-            steps.h[worst_indices],
-        )
-        n_substeps = n_replayed_steps(self.x.shape[1])
-        (single_step, _), (substeps, _) = (self.replay(members, self.method, x, h / m, m) for m in (1, n_substeps))
-        ends = [self._user_states(after["x"] + after["compensation"]) for after in (single_step, substeps)]
-        start = self._user_states(x)
-        motion = np.abs(ends[0] - start).max(axis=1)
-        is_known = (single_step["status"] == 0) & (substeps["status"] == 0)
-        is_moving = ~is_known | (motion > MIN_RELATIVE_MOTION * np.abs(start).max(axis=1))
-        if not is_moving.any():
-            return evidence
-        errors = np.abs(ends[1] - ends[0]).max(axis=1) / np.fmax(
-            np.fmax(motion, min_motion[member_of_step[worst_indices]]), SMALLEST_NORMAL
-        )
-        errors = np.where(is_moving, np.where(is_known, errors, defect), 0.0)
-        max_index = int(np.argmax(errors))
-        return replace(
-            evidence,
-            local_error=float(errors[max_index]),
-            error_time=float(steps.t[worst_indices[max_index]]),
-            looked=len(steps.h),
-        )
-
-    def _conditions(self) -> tuple[RunCondition, ...]:
-        """Return the conditions beside the laws, each of the trajectory of the sample where it is worst."""
-        guarantees = frozenset(self.method.preserves)
-        return worst_conditions(
-            self.family.member(i).run_conditions(states, self.saved_times, guarantees)
-            for i, states in enumerate(self._known_states())
-        )
-
-    def _drifts(self) -> dict[str, InvariantDrift]:
-        """Return the drifts of what the method promises to keep, each of the trajectory where it is worst."""
-        return largest_drifts(self._member_drifts(i, states) for i, states in enumerate(self._known_states()))
-
-    def _member_drifts(self, i: int, states: np.ndarray) -> dict[str, InvariantDrift]:
-        recorded, laws = invariants_and_laws(self.family.member(i), self.method)
-        functions = {name: function for name, (function, _) in recorded.items() if name in laws.conserved}
-        if not functions or not len(states):
-            return {}
-        scales = map(column_maxima, evaluate_at_points(rounding_scales, tuple(functions.values()), states))
-        columns = zip(series_of_functions(functions, states).items(), *scales, strict=True)
-        return {name: InvariantDrift.from_series(values, *maxima) for (name, values), *maxima in columns}
-
-    def _known_states(self) -> Iterator[np.ndarray]:
-        """Return the saved states of each trajectory of the sample up to its end; nothing if none were kept."""
-        return (states[np.isfinite(states).all(axis=1)] for states in self.saved_states)
-
-    def _rounding_scales(self, parameters: np.ndarray) -> dict[str, float]:
-        """Return the sizes that set the rounding errors of energy and entropy, each the largest over the sample."""
-        rows = np.concatenate([parameters, self.x], axis=1)
-        max_scales = evaluate_at_points(member_rounding_scales, (self.family.form, parameters.shape[1]), rows).max(
-            axis=0
-        )
-        return {
-            name: float(scale) for name, scale in zip(("energy", "entropy"), np.nan_to_num(max_scales), strict=False)
-        }
-
-    def _user_states(self, x: np.ndarray) -> np.ndarray:
-        return np.asarray(self.member.points(x)).reshape(len(x), -1)
-
-
-def _sampled_saved_states(
-    record: EnsembleRecord, sample: np.ndarray
-) -> tuple[Sequence[np.ndarray] | np.ndarray, np.ndarray]:
-    """Return saved states of the trajectories with these indices, shape (sample, times, n), at times spread over the
-    run.
-
-    Both are empty if the run keeps no states.
-    """
-    if record.trajectories is None:
-        if record.x is None:
-            return (), np.zeros(0)
-        states = np.stack([record.x0[sample], record.x[sample]], axis=1)
-        end = np.nanmax(record.quantities["end_time"])
-        return states, np.linspace(record.start, end, MAX_SENSITIVITY_STATES)
-    times = evenly_spaced_indices(record.trajectories.shape[1], MAX_SENSITIVITY_STATES)
-    return record.trajectories[sample][:, times, :-2], record.saved_times[times]
 
 
 def common_laws(laws_of_groups: Sequence[Laws]) -> Laws:

@@ -31,10 +31,11 @@ from .adaptive import Adaptive, make_step_control
 from .adaptive_run import MAX_STORED_VALUES, AcceptedSteps, AdaptiveRun
 from .driver import drive_fixed
 from .events import EventSet, collect_events
+from .evidence import EngineReplay
 from .noise import NoisePaths
 from .problem import Problem
 from .schedule import EngineCall, StepSchedule
-from .solution_builder import EngineReplay, build_solution, run_provenance
+from .solution_builder import build_solution, run_provenance
 from .termination import (
     INTERRUPTING_ERRORS,
     adaptive_failure_status,
