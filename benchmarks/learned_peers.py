@@ -128,7 +128,7 @@ def train(peer: PeerModel, data: list[Trajectory], scales: DataScales, steps: in
     parameter_vector = losses.ParameterVector(
         np.asarray(start), shapes, lambda vector: UnscaledPeer(unravel(vector), scales)
     )
-    task = losses.trajectory_matching_objective(parameter_vector, data, None, scales)
+    task = losses.spline_matching_objective(parameter_vector, data, None, scales)
     training = TrainingRun(
         [Phase("matching", task, None, steps, rate, BATCH_SIZES["matching"], shapes)],
         parameter_vector.initial_values,

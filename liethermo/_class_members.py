@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from manifolds._class_members import LIBRARY_PACKAGES, add_class_members
+from manifolds._class_members import LIBRARY_PACKAGES, declare_class_members
 
 LIBRARY_PACKAGES.add("liethermo")
-add_class_members(
+declare_class_members(
     {
         # Systems
         "System": "state vector_field entropy_production casimirs / temperatures first_integrals check",

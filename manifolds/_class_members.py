@@ -17,14 +17,14 @@ HELP_MEMBERS: dict[str, tuple[str, ...]] = {}
 """Members that ``help()`` of a class lists."""
 
 
-def add_class_members(members: dict[str, str]) -> None:
-    """Add the members of classes that users call, as names divided by blanks; ``help()`` lists those before a slash."""
+def declare_class_members(members: dict[str, str]) -> None:
+    """Declare the members of each class that users call, as a text of names; ``help()`` lists those before a slash."""
     for owner, names in members.items():
         HELP_MEMBERS[owner] = tuple(names.partition("/")[0].split())
         CLASS_MEMBERS[owner] = tuple(names.replace("/", " ").split())
 
 
-add_class_members(
+declare_class_members(
     {
         "Space": """
             point random belongs project inner exp log distance

@@ -12,7 +12,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var, jaxpr_as_fun
 
 
 def content_key(obj: Any) -> Hashable:
-    """Return a hashable key that is equal for equal operations and numbers.
+    """Return a hashable key of an object, such as a traced program, that is equal for equal operations and numbers.
 
     An object that cannot be compared by content has its identity as its key.
     """
@@ -43,20 +43,20 @@ def content_key(obj: Any) -> Hashable:
 def _jaxpr_key(jaxpr: Jaxpr) -> Hashable:
     numbering: dict[Var, int] = {}
 
-    def name(atom) -> Hashable:
+    def atom_key(atom) -> Hashable:
         return content_key(atom) if isinstance(atom, Literal) else numbering.setdefault(atom, len(numbering))
 
-    inputs = tuple((name(v), str(v.aval)) for v in (*jaxpr.constvars, *jaxpr.invars))
+    inputs = tuple((atom_key(v), str(v.aval)) for v in (*jaxpr.constvars, *jaxpr.invars))
     equations = tuple(
         (
             eqn.primitive,
             tuple((k, content_key(v)) for k, v in sorted(eqn.params.items())),
-            tuple(map(name, eqn.invars)),
-            tuple(map(name, eqn.outvars)),
+            tuple(map(atom_key, eqn.invars)),
+            tuple(map(atom_key, eqn.outvars)),
         )
         for eqn in jaxpr.eqns
     )
-    return (inputs, equations, tuple(map(name, jaxpr.outvars)))
+    return (inputs, equations, tuple(map(atom_key, jaxpr.outvars)))
 
 
 def _derivative_rule_key(rule) -> Hashable:
@@ -89,6 +89,7 @@ def _derivative_rule_key(rule) -> Hashable:
 
 
 def _closure_values(function) -> list:
+    """Return the values of the variables that a function has captured."""
     return [cell.cell_contents for cell in getattr(function, "__closure__", None) or () if _has_contents(cell)]
 
 

@@ -52,7 +52,7 @@ def expression(polynomial: Polynomial | Formula, variables: Sequence[sympy.Symbo
         return sympy.sympify(polynomial.text, locals=meanings)
     return sympy.Add(
         *(
-            _number(coefficient) * sympy.Mul(*(x**e for x, e in zip(generators, power, strict=True)))
+            _to_sympy_number(coefficient) * sympy.Mul(*(x**e for x, e in zip(generators, power, strict=True)))
             for power, coefficient in polynomial.terms
         )
     )
@@ -77,7 +77,7 @@ def polynomial(expression: Any, variables: Sequence[sympy.Symbol]) -> Polynomial
         power = tuple(int(powers_of.get(x, 0)) for x in variables)
         terms[power] = terms.get(power, 0) + number
     powers = np.array(list(terms), dtype=np.int64).reshape(-1, len(variables))
-    result = Polynomial(powers, [_coefficient(value) for value in terms.values()])
+    result = Polynomial(powers, [_from_sympy_number(value) for value in terms.values()])
     return result.with_names(*map(str, variables))
 
 
@@ -104,19 +104,21 @@ def algebra(constants: Any, name: str = "g", basis_names: Sequence[str] | None =
     entries = sympy.ImmutableDenseNDimArray(constants)
     if len(entries.shape) != 3:
         raise ShapeError(f"structure constants must have three indices, got {len(entries.shape)}")
-    coefficients = [_coefficient(entries[i]) for i in np.ndindex(*entries.shape)]
+    coefficients = [_from_sympy_number(entries[i]) for i in np.ndindex(*entries.shape)]
     table = np.empty(len(coefficients), dtype=object)
     table[:] = coefficients
     return LieAlgebra.from_structure_constants(table.reshape(entries.shape), name, basis_names)
 
 
-def _number(value: Fraction | float) -> sympy.Expr:
+def _to_sympy_number(value: Fraction | float) -> sympy.Expr:
+    """Return a fraction as a SymPy rational, a float as a SymPy float of 17 digits."""
     if isinstance(value, Fraction):
         return sympy.Rational(value.numerator, value.denominator)
     return sympy.Float(value, 17)
 
 
-def _coefficient(value: Any) -> Fraction | float:
+def _from_sympy_number(value: Any) -> Fraction | float:
+    """Return a real SymPy number as a Fraction or a float; raise ComponentError if it is none."""
     if value.is_Rational:
         return Fraction(int(value.p), int(value.q))
     if value.is_number and value.is_real:

@@ -120,6 +120,9 @@ def _code_cell(identity: str, code: str, output: Output) -> dict[str, Any]:
 
 def run_page(docname: str, text: str) -> Results:
     """Run the blocks of a page in order, in an empty folder for the files that they write and read again."""
+    import matplotlib.pyplot as plt
+
+    plt.close("all")  # figures that something else in this process left open are not the page's
     results, namespace = Results([], []), {"__name__": "__main__"}
     with tempfile.TemporaryDirectory() as place, contextlib.chdir(place):
         for block in BLOCK.finditer(text):

@@ -20,7 +20,7 @@ from ..functions.bath_energy import BodyBathsEnergy
 from ..functions.density import matrix_logarithm
 from ..functions.indices import Indices
 from .operators import ENERGY_RTOL, commutator, is_hermitian, level_gap_rounding, subtract_common_energy
-from .quantum import ThermalJumps, cluster_labels, friction_image
+from .quantum import ThermalJumps, apply_jump_friction, cluster_labels
 
 ADIABATIC_LIMIT = 0.1
 """Largest adiabatic parameter at which jumps between instantaneous levels count as valid (dimensionless)."""
@@ -108,11 +108,11 @@ class AdiabaticJumps(ThermalJumps):
 
     def bind_to(self, system):
         structure = self._checked_structure(system)
-        if system.baths is None:
+        if not system.baths.number:
             raise InputError("AdiabaticJumps exchange heat with a bath. Give the system baths=lt.HeatBaths(...)")
         body_energy = system.energy.body if isinstance(system.energy, BodyBathsEnergy) else system.energy
         if is_traced(body_energy):
-            groups = _distinct_pair_groups(structure.size)
+            groups = _distinct_level_pair_groups(structure.size)
         else:
             hamiltonians = system.hamiltonians()
             groups = _group_numbers_of_level_pairs(hamiltonians)
@@ -145,9 +145,9 @@ class AdiabaticJumps(ThermalJumps):
         rho, A = (adjoint(vectors) @ structure.matrix(a[:n]) @ vectors for a in (x, dS))
         gaps = levels[None, :] - levels[:, None]
         bath_terms = (dS[n + self.bath] * V * gaps - omega[:, None, None] * V) / T
-        image = friction_image(rho, matrix_logarithm(rho), A, V, omega / (2.0 * T), bath_terms)
+        image = apply_jump_friction(rho, matrix_logarithm(rho), A, V, omega / (2.0 * T), bath_terms)
         drho = jnp.sum(commutator(adjoint(V), image * rates[:, None, None]), axis=0)
-        return self._with_bath_entropy(system, T, levels, vectors, drho)  # the adjoints add the adjoint
+        return self._force_with_bath_entropy_rates(system, T, levels, vectors, drho)  # the adjoints add the adjoint
 
     def generator_field(self, system, x, dH):
         """Return the force as Lindblad's equation, without a logarithm, followed by the bath entropy rates."""
@@ -160,12 +160,13 @@ class AdiabaticJumps(ThermalJumps):
         rates = jnp.concatenate([strengths * factors, strengths / factors])[:, None, None]
         # the Hermitian part, taken later, has both terms of the loss
         drho = jnp.sum(rates * (V @ rho @ adjoint(V)), axis=0) - jnp.sum(rates * (adjoint(V) @ V), axis=0) @ rho
-        return self._with_bath_entropy(system, T, levels, vectors, drho)
+        return self._force_with_bath_entropy_rates(system, T, levels, vectors, drho)
 
     def _jumps_at(self, system, dH, T) -> InstantaneousJumps:
+        """Return the jumps between the levels of the Hamiltonian dH, with their rates at the bath temperature T."""
         structure = system.structure
         levels, vectors = ordered_eigenvectors(structure.matrix(dH[: system.body_dim]))
-        masks = _group_masks(self.pair_groups)
+        masks = _level_pair_group_masks(self.pair_groups)
         # the group of frequency zero comes first; its gaps cancel in pairs
         omega = jnp.sum(masks * (levels[None, :] - levels[:, None]), axis=(-2, -1)) / np.sum(masks, axis=(-2, -1))
         omega = jnp.where(np.arange(len(masks)) == 0, 0.0, omega)
@@ -174,23 +175,25 @@ class AdiabaticJumps(ThermalJumps):
             is_self_adjoint = is_hermitian(operator)
             V = adjoint(vectors) @ np.asarray(operator) @ vectors
             rounding = ENERGY_RTOL * structure.size * float(np.abs(np.asarray(operator)).max())
-            parts = [(V, slice(None))] if is_self_adjoint else [(V, slice(None)), (adjoint(V), slice(1, None))]
-            for matrix, use in parts:
-                components = masks[use] * matrix
+            matrices_and_groups = (
+                [(V, slice(None))] if is_self_adjoint else [(V, slice(None)), (adjoint(V), slice(1, None))]
+            )
+            for matrix, group_slice in matrices_and_groups:
+                components = masks[group_slice] * matrix
                 # a rate may be infinite at omega = 0, where many couplings have no component
                 is_zero = jnp.max(jnp.abs(components), axis=(-2, -1)) <= rounding
-                weights = np.where((np.arange(len(masks)) == 0) & is_self_adjoint, 0.5, 1.0)[use]
-                used_omega = jnp.where(is_zero, 1.0, omega[use])
+                weights = np.where((np.arange(len(masks)) == 0) & is_self_adjoint, 0.5, 1.0)[group_slice]
+                used_omega = jnp.where(is_zero, 1.0, omega[group_slice])
                 component_rates = jnp.stack([self._rate_at(i, w, T, system.time) for w in used_omega])
                 operators.append(jnp.where(is_zero[:, None, None], 0.0, components))
-                frequencies.append(omega[use])
+                frequencies.append(omega[group_slice])
                 rates.append(weights * component_rates)
         return InstantaneousJumps(
             levels, vectors, jnp.concatenate(operators), jnp.concatenate(frequencies), jnp.concatenate(rates)
         )
 
-    def _with_bath_entropy(self, system, T, levels, vectors, drho) -> jax.Array:
-        """Return the coordinates of ``drho``, given in the eigenvectors, followed by the bath entropy rates.
+    def _force_with_bath_entropy_rates(self, system, T, levels, vectors, drho) -> jax.Array:
+        """Return the force of ``drho``, given in the eigenvectors of H, followed by the bath entropy rates, shape (n,).
 
         ``tr(H drho)`` is summed by parts, from differences of neighbouring levels and the populations that cross.
         """
@@ -219,17 +222,17 @@ def adiabatic_parameter(structure: mf.DensityMatrices, hamiltonian_coordinates, 
     return jnp.max(jnp.where(is_mixed, elements / jnp.where(is_mixed & (gaps > 0.0), gaps, 1e-300) ** 2, 0.0))
 
 
-def _group_masks(pair_groups: Indices | None) -> np.ndarray:
+def _level_pair_group_masks(pair_groups: Indices | None) -> np.ndarray:
     """Return the masks of the groups of pairs of levels, shape (groups, N, N); the first one has frequency zero."""
     assert pair_groups is not None
     groups = np.asarray(pair_groups)
     return (groups == np.arange(groups.max() + 1)[:, None, None]).astype(float)
 
 
-def _distinct_pair_groups(size: int) -> np.ndarray:
-    """Return groups in which every pair j < k has its own, shape (N, N): zero on the diagonal, -1 below it."""
-    groups = np.where(np.tri(size, k=-1, dtype=bool), -1, 0)
-    j, k = np.triu_indices(size, 1)
+def _distinct_level_pair_groups(n_levels: int) -> np.ndarray:
+    """Return group numbers, shape (N, N), different for all pairs of levels j < k; 0 on the diagonal, -1 below it."""
+    groups = np.where(np.tri(n_levels, k=-1, dtype=bool), -1, 0)
+    j, k = np.triu_indices(n_levels, 1)
     groups[j, k] = np.arange(1, len(j) + 1)
     return groups
 

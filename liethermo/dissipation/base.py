@@ -258,7 +258,7 @@ class DissipationSum(Dissipation):
         if not self.parts:
             return jnp.zeros_like(x)
         return sum(
-            term.force(system, x, dH, dS, dL_part) for term, dL_part in terms_with_preserved_values(self.parts, dL)
+            term.force(system, x, dH, dS, dL_term) for term, dL_term in terms_with_preserved_values(self.parts, dL)
         )
 
     @property
@@ -269,7 +269,7 @@ class DissipationSum(Dissipation):
         return sum(part.generator_field(system, x, dH) for part in self.parts)
 
     def factor(self, system, x, dH, dL):
-        factors = [term.factor(system, x, dH, dL_part) for term, dL_part in terms_with_preserved_values(self.parts, dL)]
+        factors = [term.factor(system, x, dH, dL_term) for term, dL_term in terms_with_preserved_values(self.parts, dL)]
         known_factors = [B for B in factors if B is not None]
         return concatenate_factors(known_factors) if len(known_factors) == len(factors) else None
 
@@ -278,8 +278,8 @@ ABSENT_DISSIPATION = DissipationSum(())
 """Dissipation of a system that has none: energy and entropy are conserved, and the force is zero."""
 
 
-def nondecreasing_if(is_known: bool) -> LawName | None:
-    """Return the law of an entropy that is known not to decrease, or None."""
+def nondecreasing_law_if(is_known: bool) -> LawName | None:
+    """Return "nondecreasing", the law of an entropy, if it is known to hold; otherwise None."""
     return "nondecreasing" if is_known else None
 
 

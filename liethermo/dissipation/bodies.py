@@ -76,8 +76,8 @@ class HeatConduction(Dissipation):
     def force(self, system, x, dH, dS, dL):
         S, i, j = self.entropy_indices(system), np.asarray(self.first_bodies), np.asarray(self.second_bodies)
         T_factors = dH[S] if self.fourier_factors == "discrete" else system.energy.gradient(x)[S]
-        first, second = self.edge_entropy_rates(x, dH[S], dS[S], T_factors)
-        return jnp.zeros_like(x).at[S[i]].add(first).at[S[j]].add(second)
+        first_rates, second_rates = self.edge_entropy_rates(x, dH[S], dS[S], T_factors)
+        return jnp.zeros_like(x).at[S[i]].add(first_rates).at[S[j]].add(second_rates)
 
     def edge_entropy_rates(self, x, T, dS, T_factors) -> tuple[jax.Array, jax.Array]:
         """Return the entropy rates of the first and the second body of each edge, shape (edges,).
@@ -131,16 +131,18 @@ class LinearFriction(Dissipation):
 
     def force(self, system, x, dH, dS, dL):
         p, S, R, v, T = self._indices_form_velocities_temperatures(system, x, dH)
-        return self._force_of_flux(x, p, S, v, T, _apply_form(R, (v * dS[S] - T * dS[p]) / T))
+        return self._force_from_flux(x, p, S, v, T, _apply_friction_matrix(R, (v * dS[S] - T * dS[p]) / T))
 
     def factor(self, system, x, dH, dL):
         p, S, R, v, T = self._indices_form_velocities_temperatures(system, x, dH)
         matrix_root = semidefinite_root if callable(self.R) else semidefinite_factor
         root = jnp.sqrt(R) if jnp.ndim(R) < 2 else matrix_root(R)
-        return Factor(len(p), lambda w: self._force_of_flux(x, p, S, v, T, _apply_form(root, w) / jnp.sqrt(T)))
+        return Factor(
+            len(p), lambda w: self._force_from_flux(x, p, S, v, T, _apply_friction_matrix(root, w) / jnp.sqrt(T))
+        )
 
     @staticmethod
-    def _force_of_flux(x, p, S, v, T, flux) -> jax.Array:
+    def _force_from_flux(x, p, S, v, T, flux) -> jax.Array:
         return jnp.zeros_like(x).at[p].add(-T * flux).at[S].add(v * flux)
 
     def _indices_form_velocities_temperatures(self, system, x, dH):
@@ -179,31 +181,31 @@ class Drag(Dissipation):
         self.coefficient = graph.weight
 
     def force(self, system, x, dH, dS, dL):
-        (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, force_of_flux = self._edge_indices_values_weights(system, x, dH)
+        (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, force_from_flux = self._edge_indices_values_weights(system, x, dH)
         z_dot_dS = dS[p_j] - dS[p_i] + 0.5 * w * (dS[S_i] / T_i + dS[S_j] / T_j)
-        return force_of_flux(weight * z_dot_dS)
+        return force_from_flux(weight * z_dot_dS)
 
     def factor(self, system, x, dH, dL):
-        _, _, weight, force_of_flux = self._edge_indices_values_weights(system, x, dH)
-        return Factor(len(weight), lambda w: force_of_flux(jnp.sqrt(weight) * w))
+        _, _, weight, force_from_flux = self._edge_indices_values_weights(system, x, dH)
+        return Factor(len(weight), lambda w: force_from_flux(jnp.sqrt(weight) * w))
 
     def _edge_indices_values_weights(self, system, x, dH):
         """Return indices (p_i, p_j, S_i, S_j), values (T_i, T_j, v_i - v_j), ``c / theta``, and flux -> ``flux z``."""
         indices = _state_indices(system)
-        i, j, edge = _momentum_and_edge_numbers(self.first_bodies, self.second_bodies, indices)
+        i, j, edge = _momentum_and_edge_indices(self.first_bodies, self.second_bodies, indices)
         S_i, S_j, p_i, p_j = indices.S[indices.owner[i]], indices.S[indices.owner[j]], indices.p[i], indices.p[j]
         T_i, T_j, w = _nan_unless_positive(dH[S_i]), _nan_unless_positive(dH[S_j]), dH[p_i] - dH[p_j]
 
-        def force_of_flux(flux):
+        def force_from_flux(flux):
             force = jnp.zeros_like(x).at[S_i].add(0.5 * w * flux / T_i).at[S_j].add(0.5 * w * flux / T_j)
             return force.at[p_i].add(-flux).at[p_j].add(flux)
 
         weight = self.coefficient[edge] * (2.0 * T_i * T_j / (T_i + T_j))
-        return (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, force_of_flux
+        return (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, force_from_flux
 
     def couplings(self, system):
         indices = _state_indices(system)
-        i, j, _ = _momentum_and_edge_numbers(self.first_bodies, self.second_bodies, indices)
+        i, j, _ = _momentum_and_edge_indices(self.first_bodies, self.second_bodies, indices)
         S_i, S_j = indices.S[indices.owner[i]], indices.S[indices.owner[j]]
         return clique_pattern(np.stack([indices.p[i], S_i, indices.p[j], S_j], axis=1), system.dim)
 
@@ -237,6 +239,7 @@ class ContactFriction(SkewFriction):
 
 
 def _state_indices(system) -> StateIndices:
+    """Return the indices of all q, p and S in the states of a system."""
     return system.poisson.state_indices
 
 
@@ -245,19 +248,20 @@ def _nan_unless_positive(T):
     return jnp.where(T > 0.0, T, jnp.nan)
 
 
-def _apply_form(R, v):
+def _apply_friction_matrix(R, v):
+    """Return ``R v`` for a matrix R, or for the diagonal of one."""
     return R * v if jnp.ndim(R) < 2 else R @ v
 
 
-def _body_component_indices(indices: StateIndices, momentum_numbers: np.ndarray) -> np.ndarray:
+def _body_component_indices(indices: StateIndices, momentum_indices: np.ndarray) -> np.ndarray:
     """Return the indices of all state components of the body with these momenta."""
     return np.concatenate(
-        [indices.q[momentum_numbers], indices.p[momentum_numbers], indices.S[indices.owner[momentum_numbers[:1]]]]
+        [indices.q[momentum_indices], indices.p[momentum_indices], indices.S[indices.owner[momentum_indices[:1]]]]
     )
 
 
-def _momentum_and_edge_numbers(first_bodies: Indices, second_bodies: Indices, indices: StateIndices):
-    """Return for each edge and component the indices of the momenta at its two ends and of the edge, three arrays."""
+def _momentum_and_edge_indices(first_bodies: Indices, second_bodies: Indices, indices: StateIndices):
+    """Return three index arrays, over edges and components: the momenta at the two ends of an edge, and the edge."""
     i, j = np.asarray(first_bodies), np.asarray(second_bodies)
     starts = np.searchsorted(indices.owner, np.arange(len(indices.S)))
     counts = np.bincount(indices.owner, minlength=len(indices.S))[i]
@@ -319,8 +323,8 @@ class MatterExchange(Dissipation):
         self.processes = tuple(processes)
 
     def force(self, system, x, dH, dS, dL):
-        z_dot, apply_fluxes = self._affinity_and_velocity_maps(system, x, dH)
-        return apply_fluxes(self._flux_coefficients(x) * z_dot(dS))
+        affinities, apply_fluxes = self._affinity_and_velocity_maps(system, x, dH)
+        return apply_fluxes(self._flux_coefficients(x) * affinities(dS))
 
     def factor(self, system, x, dH, dL):
         _, apply_fluxes = self._affinity_and_velocity_maps(system, x, dH)
@@ -328,7 +332,7 @@ class MatterExchange(Dissipation):
         return Factor(len(self.processes), lambda w: apply_fluxes(root * w))
 
     def _flux_coefficients(self, x) -> jax.Array:
-        """Return L of each process; NaN where it is negative: the step is then rejected."""
+        """Return the coefficient L of each process, shape (processes,); NaN where it is negative rejects the step."""
         coefficients = [e.coefficient(x) if callable(e.coefficient) else e.coefficient for e in self.processes]
         L = jnp.stack([jnp.asarray(value) for value in coefficients])
         return jnp.where(L >= 0.0, L, jnp.nan)

@@ -68,60 +68,60 @@ def checked_bath_indices(bath) -> Indices | None:
     return Indices(numbers)
 
 
-def reject_rate_as_form(form, dissipation: object, what: str) -> None:
+def reject_rate_as_form(form, dissipation: object, label: str) -> None:
     """Raise InputError if a number is passed for a form: it is more likely meant as a rate."""
     if isinstance(form, int | float):
         raise InputError(
-            f"{type(dissipation).__name__} takes {what} first, a matrix, and {form} is a number: for a rate say "
+            f"{type(dissipation).__name__} takes {label} first, a matrix, and {form} is a number: for a rate say "
             f"rate={form}"
         )
 
 
-def checked_semidefinite(form, what: str, symmetric: bool = True) -> jax.Array:
+def checked_semidefinite(form, label: str, symmetric: bool = True) -> jax.Array:
     """Return a form as a positive semidefinite matrix (or a traced one).
 
     Without ``symmetric`` only its symmetric part has to be semidefinite.
     """
-    matrix = checked_numbers(form, what)
+    matrix = checked_numbers(form, label)
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
-        raise InputError(f"{what} must be a square matrix, got shape {matrix.shape}")
+        raise InputError(f"{label} must be a square matrix, got shape {matrix.shape}")
     if isinstance(matrix, jax.core.Tracer):
         eigenvalues = jnp.linalg.eigvalsh((matrix + matrix.T) / 2)
         tolerance = 1e-12 * matrix.shape[0] * jnp.abs(matrix).max()
         require_condition(
-            eigenvalues[0], lambda eigenvalue: eigenvalue >= -tolerance, f"{what} {NEGATIVE_EIGENVALUE_MESSAGE}"
+            eigenvalues[0], lambda eigenvalue: eigenvalue >= -tolerance, f"{label} {NEGATIVE_EIGENVALUE_MESSAGE}"
         )
         return matrix
     entries = np.asarray(matrix)
     if not np.isfinite(entries).all():
-        raise InputError(f"{what} must be finite, got {entries.tolist()}")
+        raise InputError(f"{label} must be finite, got {entries.tolist()}")
     scale = float(np.abs(entries).max())
     asymmetry = float(np.abs(entries - entries.T).max())
     if symmetric and not asymmetry <= 1e-12 * scale:
-        raise InputError(f"{what} is not symmetric: it differs from its transpose by {asymmetry:.3g}")
+        raise InputError(f"{label} is not symmetric: it differs from its transpose by {asymmetry:.3g}")
     min_eigenvalue = float(np.linalg.eigvalsh(0.5 * (entries + entries.T))[0])
     if min_eigenvalue < -1e-12 * scale * matrix.shape[0]:
         raise IndefiniteError(
-            f"{what} {NEGATIVE_EIGENVALUE_MESSAGE}".format(value=min_eigenvalue),
+            f"{label} {NEGATIVE_EIGENVALUE_MESSAGE}".format(value=min_eigenvalue),
             residual=min_eigenvalue,
             tolerance=1e-12 * scale * matrix.shape[0],
         )
     return matrix
 
 
-def check_form_shape(form, dim: int, what: str) -> None:
+def check_form_shape(form, dim: int, label: str) -> None:
     """Raise InputError unless a form, or the value of a form that depends on the state, has shape (dim, dim)."""
     if isinstance(form, BlockDiagonal):
         return
     if isinstance(form, Diagonal):
         if form.entries.shape != (dim,):
-            raise InputError(f"{what} has {form.entries.size} entries, and a state has {dim} components")
+            raise InputError(f"{label} has {form.entries.size} entries, and a state has {dim} components")
         return
     if callable(form):
-        traced_function_and_shape(form, [(dim,)], [(dim, dim)], what, f"a state of shape ({dim},)")
+        traced_function_and_shape(form, [(dim,)], [(dim, dim)], label, f"a state of shape ({dim},)")
     elif form.shape != (dim, dim):
         raise InputError(
-            f"{what} must be a ({dim}, {dim}) matrix for a state of {dim} components, got shape {form.shape}"
+            f"{label} must be a ({dim}, {dim}) matrix for a state of {dim} components, got shape {form.shape}"
         )
 
 

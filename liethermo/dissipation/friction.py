@@ -237,7 +237,7 @@ class EulerPoincareForce(Dissipation):
 
 
 class _FlattenedMap(Module):
-    """A map of arrays of one shape, as a map of flat arrays."""
+    """A map of arrays of a given shape, called with flat arrays."""
 
     function: Callable
     shape: tuple[int, ...] = eqx.field(static=True)

@@ -151,6 +151,7 @@ class HeatlessDissipation(LiftedDissipation):
 
 
 def _body_inner_geometry(system: Geometry, x) -> LiftedGeometry:
+    """Return the geometry of the body alone, whose states are the leading components of those with baths."""
     return LiftedGeometry.from_leading_components(system.drop_baths(), x, system.body_dim)
 
 
@@ -241,7 +242,7 @@ class BathConduction(HeatConduction):
         super().__init__(graph_edges(conductance, n_baths, "the conductance", names))
 
     def bind_to(self, system):
-        n_baths = 0 if system.baths is None else system.baths.number
+        n_baths = system.baths.number
         last = int(np.max(np.asarray(self.second_bodies), initial=0))
         if last >= n_baths:
             raise InputError(

@@ -71,7 +71,8 @@ class LindbladJumps(Dissipation):
             raise InputError("couplings must be a list of pairs (V, rate), such as [(V, 0.1)]")
         self.operators = tuple(_checked_operator(V, f"the jump operator V[{i}]") for i, (V, _) in enumerate(pairs))
         self.rates = tuple(
-            _checked_function(rate, i) if callable(rate) else checked_rate(rate) for i, (_, rate) in enumerate(pairs)
+            _checked_time_dependent_rate(rate, i) if callable(rate) else checked_rate(rate)
+            for i, (_, rate) in enumerate(pairs)
         )
 
     @classmethod
@@ -104,7 +105,7 @@ class LindbladJumps(Dissipation):
                     f"the factor of collapse operator {i} must be a function of t, such as lambda t: jnp.sqrt(1 + t), "
                     f"got {kind}"
                 )
-            couplings.append((matrix, 1.0 if factor is None else _SquaredFactor(factor)))
+            couplings.append((matrix, 1.0 if factor is None else _SquaredTimeFactor(factor)))
         return cls(couplings)
 
     @property
@@ -170,6 +171,7 @@ class LindbladJumps(Dissipation):
         )
 
     def _require_time(self, time) -> None:
+        """Raise InputError if a rate or an operator depends on time, and ``time`` is None."""
         if self.depends_on_time and time is None:
             raise InputError("a rate or an operator of LindbladJumps depends on time. Use system.at_time(t)")
 
@@ -191,24 +193,24 @@ class OperatorFunction(Module):
         return jnp.asarray(self.function(t), dtype=jnp.complex128)
 
 
-def _checked_operator(V: Any, what: str) -> Operator | OperatorFunction:
+def _checked_operator(V: Any, label: str) -> Operator | OperatorFunction:
     """Return a jump operator as a matrix, or as a function of time, tested at t = 0."""
     if not callable(V) or isinstance(V, HasMatrix):
-        return Operator(checked_square_matrix(V, what))
+        return Operator(checked_square_matrix(V, label))
     try:
         value = V(0.0)
     except TypeError as error:
-        raise InputError(f"{what} must be a matrix, or a function of the time t: {error}") from None
+        raise InputError(f"{label} must be a matrix, or a function of the time t: {error}") from None
     if isinstance(value, HasMatrix):
         raise InputError(
-            f"{what} is a function that returns a Qobj, which JAX cannot trace. Return an array of jax.numpy, such as "
+            f"{label} is a function that returns a Qobj, which JAX cannot trace. Return an array of jax.numpy, such as "
             "jnp.cos(t) * V.full()"
         )
-    return OperatorFunction(V, checked_square_matrix(value, what).shape)
+    return OperatorFunction(V, checked_square_matrix(value, label).shape)
 
 
-class _SquaredFactor(Module):
-    """The rate of a collapse operator with a factor that depends on time."""
+class _SquaredTimeFactor(Module):
+    """The rate ``f(t)^2`` of a collapse operator with a factor f that depends on time."""
 
     factor: Callable
 
@@ -216,8 +218,8 @@ class _SquaredFactor(Module):
         return jnp.asarray(self.factor(t)) ** 2
 
 
-def _checked_function(rate: Callable, i: int) -> Callable:
-    """Return a rate as a function of time, tested at t = 0."""
+def _checked_time_dependent_rate(rate: Callable, i: int) -> Callable:
+    """Return the rate of the jump operator V[i], a function of time, after a test at t = 0."""
     try:
         value = rate(0.0)
     except TypeError as error:

@@ -33,17 +33,17 @@ def noisy_terms_with_factors(
     InputError
         If a summand has no factor.
     """
-    result = []
-    for term, dL_part in _noisy_terms_with_values(dissipation, dL):
-        B = term.factor(system, x, dH, dL_part)
+    terms_with_factors = []
+    for term, dL_term in _noisy_terms_with_values(dissipation, dL):
+        B = term.factor(system, x, dH, dL_term)
         if B is None:
             space_text = "" if system.space is None else f" on {system.space.name}"
             raise InputError(
                 f"{type(term).__name__} gives no factor of its friction matrix{space_text}, so it has no noise. Define "
                 "Dissipation.factor"
             )
-        result.append((term, B))
-    return result
+        terms_with_factors.append((term, B))
+    return terms_with_factors
 
 
 def factor_divergences(dissipation: Dissipation, system: Geometry, x) -> jax.Array:
@@ -90,9 +90,9 @@ def factor_check_residuals(dissipation: Dissipation, system: Geometry, x) -> dic
     return {name: jnp.max(jnp.stack(values)) for name, values in residuals.items() if values}
 
 
-def generic_covectors(n: int, number: int) -> jax.Array:
-    """Return covectors in no special direction, shape (number, n); test points have other seeds, from 0."""
-    return jnp.asarray(np.random.default_rng(20_241).standard_normal((number, n)))
+def generic_covectors(n: int, count: int) -> jax.Array:
+    """Return fixed random covectors, none orthogonal to a column, shape (count, n); test points have other seeds."""
+    return jnp.asarray(np.random.default_rng(20_241).standard_normal((count, n)))
 
 
 def _noisy_terms_with_values(
@@ -104,4 +104,5 @@ def _noisy_terms_with_values(
 
 
 def _relative_max(residual, scale) -> jax.Array:
+    """Return the largest absolute entry of a residual over a scale, shape (); a scale of zero counts as one."""
     return jnp.max(jnp.abs(residual), initial=0.0) / jnp.where(scale > 0.0, scale, 1.0)

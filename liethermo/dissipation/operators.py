@@ -41,39 +41,42 @@ def get_density_structure(system: Geometry, name: str) -> mf.DensityMatrices:
     return structure
 
 
-def checked_square_matrix(matrix, what: str) -> np.ndarray:
+def checked_square_matrix(matrix, label: str) -> np.ndarray:
     """Return a square complex matrix, from an array or from the ``full()`` of a ``Qobj``."""
     array = np.asarray(matrix.full() if isinstance(matrix, HasMatrix) else matrix)
     if array.dtype.kind not in "fiuc" or array.ndim != 2 or array.shape[0] != array.shape[1] or not array.size:
         raise InputError(
-            f"{what} must be a square matrix of numbers, got an array of {array.dtype}, shape {array.shape}"
+            f"{label} must be a square matrix of numbers, got an array of {array.dtype}, shape {array.shape}"
         )
     if not np.isfinite(array).all():
-        raise InputError(f"{what} is not finite")
+        raise InputError(f"{label} is not finite")
     return array.astype(complex)
 
 
-def checked_hermitian(matrix, what: str) -> np.ndarray:
+def checked_hermitian(matrix, label: str) -> np.ndarray:
     """Return a matrix, made exactly Hermitian; InputError if it is not Hermitian to rounding."""
-    array = checked_square_matrix(matrix, what)
+    array = checked_square_matrix(matrix, label)
     residual, scale = float(np.abs(array - adjoint(array)).max()), float(np.abs(array).max())
     if residual > 1e-12 * scale:
         raise InputError(
-            f"{what} is not Hermitian: it differs from its adjoint by {residual:.3g}. Its Hermitian part is "
+            f"{label} is not Hermitian: it differs from its adjoint by {residual:.3g}. Its Hermitian part is "
             "(A + A.conj().T) / 2"
         )
     return (array + adjoint(array)) / 2
 
 
 def commutator(a, b):
+    """Return ``a b - b a`` of matrices, shape (..., N, N)."""
     return a @ b - b @ a
 
 
 def is_diagonal(H: np.ndarray) -> bool:
+    """Return True if all entries off the diagonal are exactly zero."""
     return not (H - np.diag(np.diag(H))).any()
 
 
 def is_hermitian(V) -> bool:
+    """Return True if a matrix equals its adjoint to rounding."""
     V = np.asarray(V)
     return bool(np.abs(V - adjoint(V)).max() <= 1e-12 * np.abs(V).max())
 
@@ -84,7 +87,7 @@ def subtract_common_energy(H: np.ndarray) -> np.ndarray:
 
 
 def level_gap_rounding(H: np.ndarray) -> float:
-    """Return the largest rounding difference between two equal differences of levels."""
+    """Return the largest amount by which rounding makes two equal gaps between levels of H differ."""
     return ENERGY_RTOL * (1 if is_diagonal(H) else len(H)) * float(np.linalg.norm(H, 2))
 
 

@@ -121,9 +121,11 @@ class DissipationPotential(Dissipation):
         return B.times(jax.grad(self.psi_at_state(x))(B.transpose_times(dS)))
 
     def _base_factor_at_state(self, system, x) -> Factor:
+        """Return the factor of the underlying dissipation for the exact gradients at x."""
         return self._base_factor(system, x, system.energy.gradient(x), tuple(L.gradient(x) for L in self.preserve))
 
     def _base_factor(self, system, x, dH, dL) -> Factor:
+        """Return the factor of the underlying dissipation; raise InputError if it has none."""
         B = self.of.factor(system, x, dH, dL)
         if B is None:
             space_text = "" if system.space is None else f" on {system.space.name}"
@@ -245,8 +247,9 @@ class ActivatedFriction(NamedPotential):
         return self.rate * q * hyperbolic_stumpff(2, q / self.scale**2)
 
 
-def _checked_nonnegative_number(value, what: str, allow_zero: bool) -> jax.Array:
-    number = checked_numbers(value, what, ())
+def _checked_nonnegative_number(value, label: str, allow_zero: bool) -> jax.Array:
+    """Return a number as an array, shape (); raise InputError if it is negative, or zero where that is not allowed."""
+    number = checked_numbers(value, label, ())
     if not isinstance(number, jax.core.Tracer) and not (float(number) >= 0.0 if allow_zero else float(number) > 0.0):
-        raise InputError(f"{what} must be {'>=' if allow_zero else '>'} 0, got {float(number):g}")
+        raise InputError(f"{label} must be {'>=' if allow_zero else '>'} 0, got {float(number):g}")
     return number

@@ -133,11 +133,13 @@ class ProjectedMetric(Dissipation):
         return self._projected_factor(system, x, dH, dL, n, lambda w: root @ w)
 
     def _projected_factor(self, system, x, dH, dL, n_columns: int, root_times: Callable) -> Factor:
+        """Return the factor ``P^T L``, where ``root_times(w)`` is L w and P projects off dH and dL."""
         frame = gram_schmidt((dH, *dL), metric_map=self._cometric_map(system, x))
         rate = self.rate if self.normalized else self.rate * math.prod(frame.squared_norms)
         return Factor(n_columns, lambda w: frame.project_off_transposed(root_times(w))).scale_by(rate)
 
     def _cometric_map(self, system, x):
+        """Return the map from covectors to vectors by the cometric at x, tangent to the space of the system."""
         G = evaluate_form(self.cometric, x)
         return lambda alpha: (
             system.raise_index(x, alpha)

@@ -149,7 +149,7 @@ class ThermalJumps(Dissipation):
                 "system for each Hamiltonian, as lt.Study does. Rates, temperatures and capacities may be traced"
             )
         hamiltonians = system.hamiltonians()
-        if baths is None:
+        if not baths.number:
             jumps = tuple(Jump(V, i, 0.5 if is_hermitian(V) else 1.0) for i, V in enumerate(self.operators))
             conserves_energy = all(is_commuting(H, V) for H in hamiltonians for V in map(np.asarray, self.operators))
             return replace_fields(
@@ -184,7 +184,7 @@ class ThermalJumps(Dissipation):
                     f"the coupling V[{i}] has shape {np.shape(V)}, but the Hamiltonian has shape ({structure.size}, "
                     f"{structure.size})"
                 )
-        if baths is not None and self.bath >= baths.number:
+        if 0 < baths.number <= self.bath:
             raise InputError(
                 f"{name} exchange heat with bath {self.bath}, but there are {baths.number} baths, numbered from 0"
             )
@@ -202,7 +202,7 @@ class ThermalJumps(Dissipation):
         """
         structure, n = system.structure, system.body_dim
         rho, H, A = (self._to_jump_frame(structure.matrix(a[:n])) for a in (x, dH, dS))
-        operators, logs = _stack_operators(self.jumps), matrix_logarithm(rho)
+        operators, logs = _stack_jump_operators(self.jumps), matrix_logarithm(rho)
         V, V_adjoint, omega = (
             jnp.asarray(operators),
             jnp.asarray(adjoint(operators)),
@@ -215,7 +215,7 @@ class ThermalJumps(Dissipation):
             levels, off_diagonal = self._energies_in_jump_frame(structure, dH[:n]), 1.0 - np.eye(structure.size)
             H_commutators = V * (levels[None, :] - levels[:, None]) + commutator(V, H * off_diagonal)
             bath_terms = (dS[n + self.bath] * H_commutators - omega[:, None, None] * V) / T
-        image = friction_image(rho, logs, A, V, omega / (2.0 * T), bath_terms)
+        image = apply_jump_friction(rho, logs, A, V, omega / (2.0 * T), bath_terms)
         drho = jnp.sum(
             commutator(V_adjoint, image * self._weighted_jump_rates(system, omega, T)[:, None, None]), axis=0
         )
@@ -283,7 +283,7 @@ class ThermalJumps(Dissipation):
         ``tr(H [V^H, V]) / tr(V^H V)``, with the diagonal of H by differences of levels, which lose no digits.
         """
         operators, off_diagonal, levels = (
-            _stack_operators(self.jumps),
+            _stack_jump_operators(self.jumps),
             1.0 - np.eye(structure.size),
             self._energies_in_jump_frame(structure, dH),
         )
@@ -291,8 +291,12 @@ class ThermalJumps(Dissipation):
         squares = np.sum(weights, axis=(-2, -1))
         k, j = np.nonzero(np.sum(weights * off_diagonal, axis=0))
         omega = (weights[:, k, j] / squares[:, None]) @ (levels[j] - levels[k])
-        rest = off_diagonal * commutator(adjoint(operators), operators) / squares[:, None, None]
-        return omega + structure.vector(self._from_jump_frame(rest)) @ dH if rest.any() else omega
+        off_diagonal_weights = off_diagonal * commutator(adjoint(operators), operators) / squares[:, None, None]
+        return (
+            omega + structure.vector(self._from_jump_frame(off_diagonal_weights)) @ dH
+            if off_diagonal_weights.any()
+            else omega
+        )
 
     def _energies_in_jump_frame(self, structure: mf.DensityMatrices, dH) -> jax.Array:
         """Return the diagonal of H in the frame of the jumps, shape (N,)."""
@@ -360,15 +364,15 @@ def _common_eigenvectors(hamiltonians: Sequence[np.ndarray]) -> np.ndarray:
     return np.eye(len(H)) if is_diagonal(H) else np.linalg.eigh(H)[1]
 
 
-def friction_image(rho, logs, A, V, shift, bath_terms) -> jax.Array:
-    """Return ``L B`` of jumps at a covector, shape (jumps, N, N), in a frame in which all matrices are given.
+def apply_jump_friction(rho, log_rho, dS, V, shift, bath_terms) -> jax.Array:
+    """Apply the friction operator L of each jump to ``[V, dS]`` less the bath terms; return shape (jumps, N, N).
 
-    The logarithm of rho is taken out of the gradient A of the entropy: without A - (-ln rho) and ``bath_terms`` the
-    result is that of Lindblad's equation.
+    All matrices are given in one frame. The logarithm of rho is taken out of the gradient dS of the entropy: if dS is
+    -ln rho, and without ``bath_terms``, the result is that of Lindblad's equation.
 
     Parameters
     ----------
-    rho, logs, A : array, shape (N, N)
+    rho, log_rho, dS : array, shape (N, N)
         The density matrix, its logarithm, and the gradient of the entropy of rho.
     V : array, shape (jumps, N, N)
     shift : array, shape (jumps,)
@@ -376,14 +380,14 @@ def friction_image(rho, logs, A, V, shift, bath_terms) -> jax.Array:
     bath_terms : array, shape (jumps, N, N), or None
         ``(dS_bath [V, H] - omega V) / T``.
     """
-    commutators = commutator(V, A + logs)
+    commutators = commutator(V, dS + log_rho)
     if bath_terms is not None:
         commutators = commutators - bath_terms
     boltzmann_factors = jnp.exp(shift)[:, None, None]
-    return rho @ V / boltzmann_factors - boltzmann_factors * (V @ rho) + log_mean(logs, shift, commutators)
+    return rho @ V / boltzmann_factors - boltzmann_factors * (V @ rho) + log_mean(log_rho, shift, commutators)
 
 
-def _stack_operators(jumps: tuple[Jump, ...]) -> np.ndarray:
+def _stack_jump_operators(jumps: tuple[Jump, ...]) -> np.ndarray:
     """Return the matrices of the jumps, shape (jumps, N, N), as real ones if possible."""
     operators = np.stack([np.asarray(jump.operator) for jump in jumps])
     return operators if operators.imag.any() else operators.real
@@ -391,7 +395,7 @@ def _stack_operators(jumps: tuple[Jump, ...]) -> np.ndarray:
 
 def _operators_and_adjoints(jumps: tuple[Jump, ...]) -> np.ndarray:
     """Return the matrices of the jumps, followed by their adjoints, shape (2 jumps, N, N)."""
-    operators = _stack_operators(jumps)
+    operators = _stack_jump_operators(jumps)
     return np.concatenate([operators, adjoint(operators)])
 
 
@@ -485,18 +489,23 @@ def _jumps_of_coupling(
         sign = next((np.sign(w) for w, limit in zip(omegas, tolerances, strict=True) if abs(w) > limit), 0.0)
         if is_self_adjoint and sign < 0.0:
             continue
-        part = np.zeros_like(V_framed)
-        part[entries[0][is_member], entries[1][is_member]] = V_framed[entries][is_member]
+        component = np.zeros_like(V_framed)
+        component[entries[0][is_member], entries[1][is_member]] = V_framed[entries][is_member]
         for H, omega, tolerance in zip(framed_hamiltonians, omegas, tolerances, strict=True):
-            if not np.abs(commutator(H, part) + omega * part).max() <= len(H) * tolerance * np.abs(part).max():
+            if (
+                not np.abs(commutator(H, component) + omega * component).max()
+                <= len(H) * tolerance * np.abs(component).max()
+            ):
                 raise InputError(
                     f"the coupling V[{coupling_index}] cannot be split into components with [H, V] = -omega V, "
                     "since the eigenvectors of the Hamiltonian depend on time. Only its eigenvalues may. For a slow "
                     "drive use lt.AdiabaticJumps, for a weak one lt.LindbladJumps with the jumps of the undriven "
                     "system"
                 )
-        part = part if sign >= 0.0 else adjoint(part)  # both act, and rates are evaluated at a positive omega
-        jumps.append(Jump(Operator(part), coupling_index, 0.5 if is_self_adjoint and sign == 0.0 else 1.0))
+        component = (
+            component if sign >= 0.0 else adjoint(component)
+        )  # both act, and rates are evaluated at a positive omega
+        jumps.append(Jump(Operator(component), coupling_index, 0.5 if is_self_adjoint and sign == 0.0 else 1.0))
     return jumps
 
 

@@ -93,16 +93,15 @@ class SteepestEntropyAscent(Dissipation):
         return frame.project_off(dS[: system.body_dim])
 
     def _constraint_frame_and_metric_map(self, system, x, dH, dL) -> tuple[OrthonormalFrame, Callable]:
-        """Return the frame of the preserved gradients, orthonormal in the metric L, and the map alpha -> ``L
-        alpha``."""
+        """Return the frame of the preserved gradients, orthonormal in the metric L, and the map that applies L."""
         structure, n = system.structure, system.body_dim
         rho = positive_part(structure.matrix(x[:n]))  # a negative eigenvalue would fall ever faster
 
         def apply_metric(alpha):  # the Hermitian part of rho A has both terms
             return structure.vector(rho @ structure.matrix(alpha))
 
-        one = jnp.asarray(np.where(np.arange(n) < structure.size, 1.0, 0.0))
-        return gram_schmidt((one, dH[:n], *(L[:n] for L in dL)), metric_map=apply_metric), apply_metric
+        trace_gradient = jnp.asarray(np.where(np.arange(n) < structure.size, 1.0, 0.0))
+        return gram_schmidt((trace_gradient, dH[:n], *(L[:n] for L in dL)), metric_map=apply_metric), apply_metric
 
 
 class _Observable(eqx.Module):

@@ -138,6 +138,18 @@ class _ReservoirEnergyOfTime(StateTimeEnergy):
         return jnp.stack([0.5 * (first + last), rate * (y + 0.5 * change)])
 
 
+class ZeroEnergy(Energy):
+    """The energy of no baths, a function of no entropies."""
+
+    is_quadratic = True
+
+    def value(self, x) -> jax.Array:
+        return jnp.zeros(())
+
+    def gradient(self, x) -> jax.Array:
+        return jnp.zeros_like(x)
+
+
 def bath_terms(energy: Energy) -> list[Energy]:
     """Return the terms of the energy of baths, each as a function of the entropies of its own baths."""
     return [term.term if isinstance(term, Pullback) else term for term in energy.terms]

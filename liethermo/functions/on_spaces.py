@@ -169,6 +169,17 @@ class HalfSumOfSquares(Energy):
         return jnp.where(jnp.arange(x.size) < 3 * self.count, x, 0.0)
 
 
+class HalfSquareOfSpin(Energy):
+    """The Casimir ``|s_i|^2 / 2`` of one site, numbered from 0."""
+
+    site: int = eqx.field(static=True)
+
+    is_quadratic = True
+
+    def value(self, x) -> jax.Array:
+        return 0.5 * jnp.sum(x[3 * self.site : 3 * self.site + 3] ** 2)
+
+
 def to_component_order(x, count: int) -> jax.Array:
     """Return states, shape (..., n), whose first ``count`` spins are reordered component by component."""
     return _transpose_spins(x, (count, 3))

@@ -143,7 +143,7 @@ class OneStepMethod(Module):
         return frozenset()
 
     def initial_compensation(self, system: System, x) -> jax.Array:
-        """Return the compensation at the start of a run, shape (n,): it leads from x to the surface of the system."""
+        """Return the compensation at the start of a run, shape (n,): the displacement from x to its surface."""
         nothing = jnp.zeros_like(x)
         return nothing if system.surface is None else system.surface.correct_rounding(x, nothing)[1]
 
@@ -151,18 +151,18 @@ class OneStepMethod(Module):
         """Return the slopes, shape (stages, n), with which the iteration of the first step begins."""
         return jnp.tile(system.vector_field(x), (self.stages, 1))
 
-    def predict(self, k, before) -> jax.Array:
-        """Return a guess of the next slopes, extrapolated from k of this step and ``before`` of the last step."""
-        return 2.0 * k - before
+    def predict(self, k, previous_k) -> jax.Array:
+        """Return a guess of the next slopes, from the slopes k of this step and ``previous_k`` of the one before."""
+        return 2.0 * k - previous_k
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
-        """Return an estimate of the local error of a step, as a length like that of x; adaptive steps need it."""
+        """Return an estimate of the local error of a step, in the units of x; adaptive steps need it."""
         raise InputError(f"{self} has no error estimate: {self.why_fixed_step}")
 
     def attitude_rate(self, system: System, x) -> jax.Array:
-        """Return the rate, in radians, at which an attitude moves that follows the steps; 0 if none does.
+        """Return the angular rate, rad / time, of the attitude that follows the steps; 0 if there is no attitude.
 
-        Its error is not in :meth:`error`, so this rate limits adaptive steps.
+        :meth:`error` does not contain the error of the attitude, so this rate limits adaptive steps.
         """
         return jnp.zeros(())
 
@@ -216,7 +216,7 @@ class OneStepMethod(Module):
 
 
 class MethodWrapper(OneStepMethod):
-    """A method made from another one, with nearly the same slopes; undefined members are those of the inner method.
+    """A method that wraps an inner method and has nearly its slopes; members that it does not define are forwarded.
 
     Attributes
     ----------
@@ -275,8 +275,8 @@ class GaussMethod(OneStepMethod):
     def increment(self, h, k) -> jax.Array:
         return h * (gauss_tableau(self.number).b @ k)
 
-    def predict(self, k, before) -> jax.Array:
-        return 2.0 * k - before if self.number == 1 else extrapolation_matrix(self.number) @ k
+    def predict(self, k, previous_k) -> jax.Array:
+        return 2.0 * k - previous_k if self.number == 1 else extrapolation_matrix(self.number) @ k
 
 
 WHY_FIXED_VARIATIONAL_STEP = (
@@ -318,8 +318,8 @@ def event_check_fractions(order: int) -> np.ndarray:
 
 def is_permutation_equivariant(method: OneStepMethod) -> bool:
     """Return True if a step does not depend on the order of the components, as it does with some discrete gradients."""
-    parts = jax.tree_util.tree_leaves(method, is_leaf=lambda part: isinstance(part, DiscreteGradient))
-    return all(part.is_coordinate_order_independent for part in parts if isinstance(part, DiscreteGradient))
+    leaves = jax.tree_util.tree_leaves(method, is_leaf=lambda part: isinstance(part, DiscreteGradient))
+    return all(part.is_coordinate_order_independent for part in leaves if isinstance(part, DiscreteGradient))
 
 
 def has_error_estimate(method) -> bool:
@@ -338,7 +338,7 @@ def pullback_method(method: OneStepMethod, local_system) -> OneStepMethod:
 
 
 def checked_stages(stages) -> int:
-    """Return ``stages``, the count of Gauss nodes; raise InputError if there is no tableau for it."""
+    """Return ``stages``, the number of Gauss nodes, unchanged; raise InputError if there is no tableau for it."""
     if isinstance(stages, bool) or not isinstance(stages, int) or not 1 <= stages <= MAX_STAGES:
         raise InputError(f"stages must be an integer from 1 to {MAX_STAGES}, got {stages!r}")
     return stages
@@ -350,7 +350,7 @@ def kind_or_class_name(value) -> str:
 
 
 def checked_step_size(h) -> jax.Array:
-    """Return the step size of a run as a finite scalar that is not zero."""
+    """Return the step size h as a scalar array; raise InputError if it is zero or not finite."""
     h = checked_numbers(h, "the step h", ())
     require_condition(
         h, lambda h: (abs(h) > 0.0) & (abs(h) < np.inf), "the step h must be finite and not zero, got {value}"
@@ -359,7 +359,7 @@ def checked_step_size(h) -> jax.Array:
 
 
 def checked_run_states(system: System, x) -> jax.Array:
-    """Return the states of a run, shape (times, n), at least two."""
+    """Return the states x of a run as an array, shape (times, n); raise InputError if there are fewer than two."""
     x = system.state(x, batch=True)
     if x.ndim != 2 or len(x) < 2:
         raise InputError(f"x must have at least two states of a run, shape (times, {system.dim}), got {x.shape}")
@@ -371,10 +371,10 @@ SLOPE_ROUNDING_FACTOR = 30.0
 
 
 def generator_residual_jvp(system: System, slopes_to_stage_states: Callable, k) -> Callable:
-    """Return :meth:`OneStepMethod.residual_jvp` for the field without the entropy, at the stages of the slopes.
+    """Return the derivative of ``f(stage states) - k`` by k, where f is the generator field, which needs no entropy.
 
-    The slopes differ from that field only by the corrections of their gradients, which are of the order of the method.
-    Its derivative contains no eigenvectors.
+    It serves as :meth:`OneStepMethod.residual_jvp`: the slopes of a method differ from f only by the corrections of
+    their gradients, which are of the order of the method. The derivative of f contains no eigenvectors.
     """
     return jax.linearize(
         lambda k: jax.vmap(functools.partial(generator_field, system))(slopes_to_stage_states(k)) - k, k

@@ -48,16 +48,16 @@ class InCharts(MethodWrapper):
         )
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
-        step = self._chart_step(system, x, compensation, h, k)
+        step = self._make_chart_step(system, x, compensation, h, k)
         return step.push_forward(step.method.slopes(step.system, step.start, step.compensation, h, step.k))
 
     def move(self, system: System, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:
         """Return the point at the end of the step; NaN if the step is longer than the domain of the retraction."""
-        step = self._chart_step(system, x, compensation, h, k)
+        step = self._make_chart_step(system, x, compensation, h, k)
         end = step.start + (step.compensation + self.method.increment(h, step.k))
         is_in_domain = self._domain_fraction(system, x, self.increment(h, k)) < 1.0
-        new = jnp.where(is_in_domain, self.retraction.space.to_vector(step.system.coordinates.point(end)), jnp.nan)
-        return new, jnp.zeros_like(new)
+        x_new = jnp.where(is_in_domain, self.retraction.space.to_vector(step.system.coordinates.point(end)), jnp.nan)
+        return x_new, jnp.zeros_like(x_new)
 
     def displace(self, system: System, x, v) -> jax.Array:
         return self.retraction.space.to_vector(self.retraction.chart._point(system.points(x), system.points(v)))
@@ -96,12 +96,12 @@ class InCharts(MethodWrapper):
         )
 
     def _domain_fraction(self, system: System, x, v) -> jax.Array:
-        """Return the length of a displacement from x relative to the domain of the retraction."""
+        """Return the length of the displacement v from x, as a fraction of the domain of the retraction."""
         point = system.points(x)
         return self.retraction._reach(point, self.retraction.space._project_tangent(point, system.points(v)))
 
-    def _chart_step(self, system: System, x, compensation, h, k) -> _ChartStep:
-        """Return the step in coordinates around its base point: local system, method, start, slopes and map back."""
+    def _make_chart_step(self, system: System, x, compensation, h, k) -> _ChartStep:
+        """Return the data of the step in the chart around its base point: local system, method, start and slopes."""
         chart, space, start, x = self.retraction.chart, self.retraction.space, x, system.points(x)
         vectors = space.from_vector(k)
         coordinates_x = mf.coordinates_around(chart, x)
@@ -127,28 +127,28 @@ class InCharts(MethodWrapper):
         half_at_z = chart._carry(x, half, half)
         coordinates_z = mf.coordinates_around(chart, z)
 
-        def components_at_z(components_at_x):
+        def transport_components_to_z(components_at_x):  # by the chart, from x to its base point z
             return coordinates_z.components(chart._carry(x, half, coordinates_x.vector(components_at_x)))
 
-        def push_forward_from_z(slope_components):
-            return space.to_vector(chart._carry(z, -half_at_z, coordinates_z.vector(slope_components)))
+        def slope_at_x(slope_components_at_z):
+            return space.to_vector(chart._carry(z, -half_at_z, coordinates_z.vector(slope_components_at_z)))
 
         local = ChartSystem(system, coordinates_z, coordinates_z.centre() if self.stages == 1 else None, start)
-        k_chart = jax.vmap(components_at_z)(k_chart)
+        k_chart = jax.vmap(transport_components_to_z)(k_chart)
         start_at_z = -0.5 * self.method.increment(h, k_chart)
         return _ChartStep(
             local,
             pullback_method(self.method, local),
             start_at_z,
-            components_at_z(compensation),
+            transport_components_to_z(compensation),
             k_chart,
-            jax.vmap(push_forward_from_z),
+            jax.vmap(slope_at_x),
         )
 
-    def predict(self, k, before) -> jax.Array:
+    def predict(self, k, previous_k) -> jax.Array:
         if self.explicit or self.stages == 1:
-            return self.method.predict(k, before)
-        return 2.0 * k - before  # the extrapolation of the method does not apply: the chart has changed
+            return self.method.predict(k, previous_k)
+        return 2.0 * k - previous_k  # the extrapolation of the method does not apply: the chart has changed
 
     def __str__(self) -> str:
         return f"{self.method} with {self.retraction}"
@@ -187,7 +187,7 @@ def wrap_in_charts(
 
 
 def resolve_retraction(space: mf.Space, name_or_retraction: str | mf.Retraction) -> mf.Retraction:
-    """Return a retraction of the space, from its name or unchanged."""
+    """Return the retraction of the space with this name, or the given one; raise InputError if it has another space."""
     retraction = mf.retraction(space, name_or_retraction) if isinstance(name_or_retraction, str) else name_or_retraction
     if retraction.space != space:
         raise InputError(f"the retraction belongs to {retraction.space.name}, but the system is on {space.name}")

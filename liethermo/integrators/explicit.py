@@ -72,7 +72,7 @@ have hardly any common point, and the initial levels may have none."""
 
 
 class UncorrectedStep(NamedTuple):
-    """A step before its corrections.
+    """An explicit step before its corrections onto the levels of the laws.
 
     Attributes
     ----------
@@ -145,7 +145,7 @@ class ExplicitMethod(TransportingMethod):
 
     @abstractmethod
     def base_step(self, rates: Callable, skip_law_rates: bool, x, compensation, h) -> UncorrectedStep:
-        """Return the step from x + compensation before its corrections; it ends near the levels.
+        """Return the step from x + compensation without corrections onto the levels of the laws.
 
         Parameters
         ----------
@@ -199,14 +199,14 @@ class ExplicitMethod(TransportingMethod):
 
     def check(self, system: System) -> None:
         """Raise InputError unless the system has a law to hold and conserves the functions that are to be preserved."""
-        if not self._laws(system):
+        if not self._laws_to_hold(system):
             raise InputError(
                 f"{self} needs a system with an energy or entropy law, and this one has none. Use lt.Reference"
             )
         check_preserved(system, self.functions)
 
     def start(self, system: System, x) -> jax.Array:
-        laws = self._laws(system, self._can_follow_symplectic_leaf(system))
+        laws = self._laws_to_hold(system, self._can_follow_symplectic_leaf(system))
         levels = jnp.stack([law.function.value(x) for law in laws])[: _max_stored_levels(system)]
         levels = jnp.concatenate([levels, jnp.zeros(x.shape[0] - levels.shape[0])])
         return (
@@ -221,29 +221,31 @@ class ExplicitMethod(TransportingMethod):
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         """Return the rows of :class:`StepRow`; of the k passed in, only the initial levels are used."""
-        leaf, n, skip_law_rates = (
+        follow_leaf, n, skip_law_rates = (
             self._can_follow_symplectic_leaf(system),
             x.shape[0],
             has_generator(system) or not system.total_dissipation.terms,
         )
-        laws = self._laws(system, leaf)
+        laws = self._laws_to_hold(system, follow_leaf)
         start_gradients = [law.function.gradient(x + compensation) for law in laws]
 
         def stage_rates(z) -> tuple[jax.Array, jax.Array]:
             """Return the rates of the state (and of the covector that carries it along a leaf) and of the laws."""
             field, changes = self.field_and_law_rates(system, laws, z[:n])
-            covector_rate = system.poisson.leaf_covector_rate(z[n:], system.energy.gradient(z[:n])) if leaf else None
+            covector_rate = (
+                system.poisson.leaf_covector_rate(z[n:], system.energy.gradient(z[:n])) if follow_leaf else None
+            )
             return field if covector_rate is None else jnp.append(field, covector_rate), changes
 
-        start, start_compensation = (jnp.append(v, jnp.zeros(n)) if leaf else v for v in (x, compensation))
+        start, start_compensation = (jnp.append(v, jnp.zeros(n)) if follow_leaf else v for v in (x, compensation))
         d, changes, error, interpolation_rows = self.base_step(
             stage_rates, skip_law_rates, start, start_compensation, h
         )
-        if leaf:
+        if follow_leaf:
             d, error, interpolation_rows = d[n:], error[:n], interpolation_rows[:, :n]
         if not isinstance(system, ChartSystem):  # in charts the initial levels are new at every step
             changes = changes + self._drift_correction_changes(
-                system, laws, start_gradients, x, compensation, k[StepRow.INITIAL_LEVELS], leaf
+                system, laws, start_gradients, x, compensation, k[StepRow.INITIAL_LEVELS], follow_leaf
             )
 
         def displacement_on_levels_and_residual(laws: list[Law]) -> tuple[jax.Array, jax.Array]:
@@ -257,8 +259,8 @@ class ExplicitMethod(TransportingMethod):
                 d,
                 changes[selection],
                 self.max_corrections,
-                leaf,
-                self._constant_momentum_dim(system),
+                follow_leaf,
+                self._constant_length_momentum_dim(system),
             )
 
         d, residual = (
@@ -271,7 +273,7 @@ class ExplicitMethod(TransportingMethod):
         )
 
     def _drift_correction_changes(
-        self, system: System, laws: list[Law], gradients: list, x, compensation, levels, leaf: bool
+        self, system: System, laws: list[Law], gradients: list, x, compensation, levels, follow_leaf: bool
     ) -> jax.Array:
         """Return the changes of the conserved functions, shape (laws,), back to the levels at the start of the run.
 
@@ -280,7 +282,7 @@ class ExplicitMethod(TransportingMethod):
         changes as the corrections of the others determine.
         """
 
-        momentum_dim = self._constant_momentum_dim(system)
+        momentum_dim = self._constant_length_momentum_dim(system)
 
         def clipped_drift(law: Law, gradient, level) -> jax.Array:
             scale = jnp.maximum(jnp.abs(level), law.function.sensitivity(x))
@@ -301,24 +303,24 @@ class ExplicitMethod(TransportingMethod):
         )
 
         def gives_small_displacement(correction) -> jax.Array:
-            displacement = correction_displacement(system, x, correction, leaf, momentum_dim)
+            displacement = correction_displacement(system, x, correction, follow_leaf, momentum_dim)
             is_small = [
                 jnp.linalg.norm(displacement[b]) <= MAX_CORRECTION_DISPLACEMENT * jnp.linalg.norm(x[b])
                 for b in system.state_blocks
             ]
             return jnp.stack(is_small).all()
 
-        def achievable_changes() -> jax.Array:
-            directions = correction_directions(system, x, gradients, leaf, momentum_dim)
+        def changes_by_level_correction() -> jax.Array:  # the drifts, as far as the level correction can cancel them
+            directions = correction_directions(system, x, gradients, follow_leaf, momentum_dim)
             correction = level_correction(system, directions, drifts, gives_small_displacement)
             return jnp.stack([jnp.dot(v, correction) for v in directions])
 
-        return jax.lax.stop_gradient(jax.lax.cond((drifts != 0.0).any(), achievable_changes, lambda: drifts))
+        return jax.lax.stop_gradient(jax.lax.cond((drifts != 0.0).any(), changes_by_level_correction, lambda: drifts))
 
     def _project_conserved_first(
         self, laws: list[Law], x, compensation, project: Callable
     ) -> tuple[jax.Array, jax.Array]:
-        """Project a step onto the conserved levels; onto all levels if a function then changes with a wrong sign.
+        """Project a step onto the levels of conserved laws, or onto all levels if a monotone function then goes wrong.
 
         A function that rises or falls does so by the motion itself. A step with the wrong sign is therefore off the
         motion by at least the size of the second projection.
@@ -348,20 +350,20 @@ class ExplicitMethod(TransportingMethod):
         dL = tuple(L.gradient(x) for L in system.preserved)
         terms = list(terms_with_preserved_values(system.total_dissipation.terms, dL))
 
-        def rate_by_dissipation(law: Law) -> jax.Array:
-            """Return the rate by dissipation alone: near rest the motion would add rounding noise."""
+        def law_rate_from_dissipation(law: Law) -> jax.Array:
+            """Return the rate of a law's function by dissipation alone: near rest the motion would add rounding."""
             if law.sign == 0.0:
                 return jnp.zeros(())
             gradient = law.function.gradient(x)
             rate = sum(term.rate_of_change(system, x, dH, dS, dL_term, gradient) for term, dL_term in terms)
             return law.sign * jnp.maximum(law.sign * rate, 0.0)
 
-        return system.field(x, dH, dS, dL), jnp.stack([rate_by_dissipation(law) for law in laws])
+        return system.field(x, dH, dS, dL), jnp.stack([law_rate_from_dissipation(law) for law in laws])
 
-    def _constant_momentum_dim(self, system: System) -> int:
-        """Return the number of leading components that are a momentum on its coadjoint orbit beside internal parts.
+    def _constant_length_momentum_dim(self, system: System) -> int:
+        """Return the number of leading components that are a momentum of constant length, in a body with moving parts.
 
-        Wheels and joints move the body also where the momentum of the whole is zero. It is 0 if there are no internal
+        Wheels and joints move the body also where the total momentum is zero. The number is 0 if there are no internal
         parts, or if the method does not hold the Casimirs of the momentum.
         """
         dim, casimirs, _ = system.orbit_levels
@@ -383,18 +385,18 @@ class ExplicitMethod(TransportingMethod):
             and jax.eval_shape(system.poisson.leaf_covector_rate, v, v) is not None
         )
 
-    def _laws(self, system: System, leaf: bool = False) -> list[Law]:
-        """Return the functions onto whose levels steps are projected: first those conserved, then those with a sign.
+    def _laws_to_hold(self, system: System, follow_leaf: bool = False) -> list[Law]:
+        """Return the laws onto whose levels steps are projected: conserved functions first, then monotone ones.
 
-        With ``leaf``, functions that are constant on a symplectic leaf are left out.
+        With ``follow_leaf``, the list has no functions that are constant on a symplectic leaf.
         """
         functions = system.functions()
         laws = [Law(system.energy, LAW_SIGNS[system.energy_law])] if system.energy_law in LAW_SIGNS else []
         constant_names = set() if system.surface is None else {system.surface.name}
-        constant_names |= set(system.casimirs()) if leaf else set()
+        constant_names |= set(system.casimirs()) if follow_leaf else set()
         laws += [Law(functions[name], 0.0) for name in self.held if name not in constant_names]
         laws += [Law(C, 0.0) for C in self.functions]
-        if system.entropy_law in LAW_SIGNS and not leaf:
+        if system.entropy_law in LAW_SIGNS and not follow_leaf:
             assert system.entropy is not None
             laws.append(Law(system.entropy, LAW_SIGNS[system.entropy_law]))
         return sorted(laws, key=lambda law: law.sign != 0.0)
@@ -402,7 +404,7 @@ class ExplicitMethod(TransportingMethod):
     def increment(self, h, k) -> jax.Array:
         return h * k[StepRow.MEAN_SLOPE]
 
-    def predict(self, k, before) -> jax.Array:
+    def predict(self, k, previous_k) -> jax.Array:
         return k
 
     def why_step_failed(self, system: System, x, k, h) -> str:
@@ -419,10 +421,10 @@ class ExplicitMethod(TransportingMethod):
 
 
 def constraint_residual(k) -> jax.Array:
-    """Return the distance of an explicit step from the levels on which it has to end, over h, shape ()."""
+    """Return the distance of an explicit step from its levels, divided by h, shape (): a row of its slopes k."""
     return jnp.max(jnp.abs(k[StepRow.CONSTRAINT_RESIDUAL]))
 
 
 def _max_stored_levels(system: System) -> int:
-    """Return the number of levels that a run stores: the number of components without angles."""
+    """Return how many initial levels a run can store, one in each component of the state that is not an angle."""
     return system.inner.dim if isinstance(system, TurningSystem) else system.dim

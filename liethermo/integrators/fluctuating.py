@@ -91,7 +91,7 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         z, dH, dS, dL = self.method.midpoint_and_gradients(system, x, compensation, h, k)
-        factors_and_inputs = self._factors_with_drift_and_noise(system, z, dH, dL, h)
+        factors_and_inputs = self._factors_and_drift_plus_noise(system, z, dH, dL, h)
         turns = [
             B.spin_coefficients[..., None] * w.reshape(-1, 3)
             for B, w in factors_and_inputs
@@ -106,7 +106,7 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
 
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
         z, dH, dS, dL = self.method.midpoint_and_gradients(system, x, compensation, h, k)
-        factors_and_inputs = self._factors_with_drift_and_noise(system, z, dH, dL, h)
+        factors_and_inputs = self._factors_and_drift_plus_noise(system, z, dH, dL, h)
         return sum((B.velocity(w) for B, w in factors_and_inputs if B.velocity), start=system.transport(z, dH, dS, dL))[
             None
         ]
@@ -117,8 +117,8 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
             B.velocity is not None for _, B in terms_with_factors_at_state(system.total_dissipation, system, point)
         )
 
-    def _factors_with_drift_and_noise(self, system: System, z, dH, dL, h) -> list[tuple[Factor, jax.Array]]:
-        """Return the factor of each summand with the vector, drift plus noise, that it is applied to."""
+    def _factors_and_drift_plus_noise(self, system: System, z, dH, dL, h) -> list[tuple[Factor, jax.Array]]:
+        """Return the pairs (B, drift + noise) of the summands of the dissipation; the slope adds their products B w."""
         terms = noisy_terms_with_factors(system.total_dissipation, system, z, dH, dL)
         split_indices = np.cumsum([B.size for _, B in terms])[:-1]
         drift = factor_divergences(system.total_dissipation, system, z)
@@ -135,7 +135,7 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
     def move(self, system: System, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:
         return apply_increment(self, system, x, compensation, self.increment(h, k), is_noisy=True)
 
-    def predict(self, k, before) -> jax.Array:
+    def predict(self, k, previous_k) -> jax.Array:
         """Return zeros: the noise of a step is independent of the previous steps."""
         return jnp.zeros_like(k)
 
@@ -143,9 +143,9 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
         return self.method.preserves_function(system, name) and noise_invariance_by_name(system)[name]
 
     def check(self, system: System) -> None:
-        """Raise InputError if the dissipation has no noise that belongs to it."""
+        """Raise InputError unless ``B B^T`` equals the friction matrix K of the dissipation, to FACTOR_RTOL."""
         self.method.check(system)
-        residual = np.nanmax(_noise_residuals_and_changes_at_samples(system)[0], initial=0.0)
+        residual = np.nanmax(_factor_residuals_and_noise_changes_at_samples(system)[0], initial=0.0)
         if not residual <= FACTOR_RTOL:
             raise InputError(
                 f"B B^T does not equal the friction matrix K: B B^T dS differs from K dS by a relative error of "
@@ -157,8 +157,7 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
 
 
 def _noise_amplitude(B: Factor, thermal_energy, h) -> jax.Array:
-    """Return the factor of the Brownian increments, ``sqrt(2 k)`` or ``sqrt(2 k T)``, corrected where noise rotates
-    spins.
+    """Return the amplitude of Brownian increments, ``sqrt(2 k)`` or ``sqrt(2 k T)``, with a correction for spins.
 
     A midpoint step with the angles w rotates a spin by ``2 atan(|w| / 2)``, less than |w|, and its friction is smaller
     too. In a weak field the spin then has the temperature of exact noise of variance ``s (1 - s / 4 + 3 s^2 / 8 -
@@ -207,7 +206,7 @@ def stochastic_method(
 
 
 def _count_factor_columns(system: System) -> int:
-    """Return the total number of columns of the factors."""
+    """Return the number of columns of the noise factors B of all dissipations of the system together."""
     dissipation, point = system.total_dissipation, jnp.asarray(system.samples(1)[0])
     column_blocks = jax.eval_shape(
         lambda x: [jnp.zeros(B.size) for _, B in terms_with_factors_at_state(dissipation, system, x)], point
@@ -223,7 +222,7 @@ def noise_dimension(method: OneStepMethod) -> int:
 
 
 def with_noise_increments(method: OneStepMethod, dW) -> OneStepMethod:
-    """Return the method for one step with the increments dW, shape (noise_dimension,)."""
+    """Return a copy of the method whose next step uses the Brownian increments dW, shape (noise_dimension,)."""
 
     def with_increments(node):
         return eqx.tree_at(lambda m: m.dW, node, dW) if _is_stochastic(node) else node
@@ -238,21 +237,21 @@ def _is_stochastic(node) -> bool:
 def noise_invariance_by_name(system: System) -> dict[str, bool]:
     """Return, for each function of a system, True if noise leaves it constant: ``B^T grad f = 0`` at random points."""
     is_invariant = {}
-    for name, (change, scale) in _noise_residuals_and_changes_at_samples(system)[1].items():
+    for name, (change, scale) in _factor_residuals_and_noise_changes_at_samples(system)[1].items():
         is_finite = np.isfinite(change)
         is_invariant[name] = bool(is_finite.any() and (change[is_finite] <= FACTOR_RTOL * scale[is_finite]).all())
     return is_invariant
 
 
 @memoize
-def _noise_residuals_and_changes_at_samples(
+def _factor_residuals_and_noise_changes_at_samples(
     system: System,
 ) -> tuple[np.ndarray, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    return evaluate_at_points(_noise_residuals_and_changes, system, system.samples(4))
+    return evaluate_at_points(_factor_residual_and_noise_changes, system, system.samples(4))
 
 
-def _noise_residuals_and_changes(system: System, x):
-    """Return the residual of ``B B^T = K``, and for each function the pair (change by noise, scale of that change)."""
+def _factor_residual_and_noise_changes(system: System, x):
+    """Return the residual of ``B B^T = K`` at x, and for each function of the system (change by noise, its scale)."""
     B = concatenate_factors([B for _, B in terms_with_factors_at_state(system.total_dissipation, system, x)])
     # The scale is the largest product with generic covectors, which none of the columns is orthogonal to.
     max_product = jnp.max(

@@ -64,15 +64,15 @@ def composed_entropy_gradients(
     """
     rates = jnp.einsum("jin,in->ij", gradients, k)
 
-    def casimir_frame(y) -> OrthonormalFrame:
+    def casimir_gradient_frame(y) -> OrthonormalFrame:
         return gram_schmidt([C.gradient(y) for C in casimirs])
 
     def entropy_coefficients(casimir_changes):
         y = x
         for _ in range(CASIMIR_NEWTON_STEPS):
             residual = casimir_changes - jnp.stack([C.value(y) - C.value(x) for C in casimirs])
-            y = y + casimir_frame(y).vector_with_inner_products(residual)
-        return casimir_frame(y).coefficients(S.gradient(y))
+            y = y + casimir_gradient_frame(y).vector_with_inner_products(residual)
+        return casimir_gradient_frame(y).coefficients(S.gradient(y))
 
     coefficients = jax.vmap(entropy_coefficients)(h * (A @ rates))
     entropy_change = FunctionChange.of(S, x, compensation, h * (b @ k), [])
@@ -223,7 +223,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
 
         This is for motions without dissipation whose held functions are all Casimirs.
         """
-        functions = self._held_functions(system) | _entropy_arguments(system)
+        functions = self._held_functions(system) | _functions_determining_entropy(system)
         casimirs = functions.keys() <= {ENTROPY_KEY, *self._casimir_names(system)}
         if system.total_dissipation.terms or not casimirs or all(C.is_quadratic for C in functions.values()):
             return None
@@ -240,11 +240,11 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         return jax.vmap(velocity)(*self._stages_and_gradients(system, x, compensation, h, k))
 
     def _stages_and_gradients(self, system: System, x, compensation, h, k) -> tuple:
-        """Return the stages, shape (s, n), the step's gradients dH and dS there, and the other gradients by name."""
+        """Return the stage states u, shape (s, n), the discrete gradients dH and dS there, and others by name."""
         A, b, _ = gauss_tableau(self.number)
         u = self._stage_states(x, compensation, h, k)
 
-        def gradients_of_function(C: Energy) -> StageGradients:
+        def discrete_and_continuous_gradients(C: Energy) -> StageGradients:
             continuous = jax.vmap(C.gradient)(u)
             if C.is_quadratic:
                 return StageGradients(continuous, continuous)
@@ -252,19 +252,19 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
                 stage_gradients(C, x, compensation, h, k, A, b, kronrod_rule(self.number)), continuous
             )
 
-        S, entropy_arguments = _entropy_with_a_law(system), _entropy_arguments(system)
+        S, entropy_functions = _entropy_if_used(system), _functions_determining_entropy(system)
         dH = self._energy_gradients(system, u, x, compensation, h, k)
         gradients_by_name = {
-            name: gradients_of_function(C)
-            for name, C in (self._held_functions(system) | entropy_arguments | preserved_by_name(system)).items()
+            name: discrete_and_continuous_gradients(C)
+            for name, C in (self._held_functions(system) | entropy_functions | preserved_by_name(system)).items()
         }
         if S is None:
             dS = jnp.zeros_like(k)
-        elif ENTROPY_KEY in entropy_arguments:
+        elif ENTROPY_KEY in entropy_functions:
             dS = gradients_by_name[ENTROPY_KEY].discrete
         else:
-            discrete = jnp.stack([gradients_by_name[name].discrete for name in entropy_arguments])
-            dS = composed_entropy_gradients(S, list(entropy_arguments.values()), discrete, x, compensation, h, k, A, b)
+            discrete = jnp.stack([gradients_by_name[name].discrete for name in entropy_functions])
+            dS = composed_entropy_gradients(S, list(entropy_functions.values()), discrete, x, compensation, h, k, A, b)
         return u, dH, dS, gradients_by_name
 
     def _stage_states(self, x, compensation, h, k) -> jax.Array:
@@ -287,7 +287,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
 
     def _conservative_slope(self, system: System, u, dH, gradients_by_name: dict[str, StageGradients]) -> jax.Array:
         """Return ``Pi dH`` without the components that would change S or a held function."""
-        functions = self._held_functions(system) | _entropy_arguments(system)
+        functions = self._held_functions(system) | _functions_determining_entropy(system)
         if all(C.is_quadratic for C in functions.values()):
             return system.poisson.sharp(u, dH)
         gradients = [gradients_by_name[name] for name in functions]
@@ -334,9 +334,12 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     def _functions_to_project_off(
         self, term: Dissipation, preserved_names: set[str], system: System
     ) -> dict[str, Energy]:
-        """Return the functions, by name, that a dissipation has to keep; empty if it keeps all by construction."""
+        """Return the functions, by name, whose gradients are projected off the force of a dissipation.
+
+        These are all functions that it has to keep; none if it keeps all of them by construction.
+        """
         functions = self._held_functions(system) | (
-            _entropy_arguments(system) if term.energy_law == "nonincreasing" else {}
+            _functions_determining_entropy(system) if term.energy_law == "nonincreasing" else {}
         )
         gradients_are_exact = system.energy.is_quadratic and (system.entropy is None or system.entropy.is_quadratic)
         casimirs = {ENTROPY_KEY, *self._casimir_names(system)} if term.preserves_casimirs else set()
@@ -355,7 +358,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         names = preserved_names(system)
         terms = terms_with_preserved_values(system.total_dissipation.terms, names)
         has_only_quadratics = all(
-            C.is_quadratic for C in (self._held_functions(system) | _entropy_arguments(system)).values()
+            C.is_quadratic for C in (self._held_functions(system) | _functions_determining_entropy(system)).values()
         )
         return has_only_quadratics and not any(
             self._functions_to_project_off(term, set(term_names), system) for term, term_names in terms
@@ -377,7 +380,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         return system.total_dissipation.is_symmetric or system.functions()[name].is_quadratic
 
     def _held_functions(self, system: System) -> dict[str, Energy]:
-        """Return the held functions by name."""
+        """Return the functions that steps hold constant, by name: those of ``held``, and the user's ``preserve``."""
         functions = system.functions()
         user_functions = {f"given {i + 1}": C for i, C in enumerate(self.functions)}
         return {name: functions[name] for name in self.held} | user_functions
@@ -427,12 +430,12 @@ ENTROPY_KEY = "the entropy"
 """Key of the entropy among the gradients by name."""
 
 
-def _entropy_arguments(system: System) -> dict[str, Energy]:
-    """Return the functions that determine the entropy, by name: all Casimirs if known, otherwise the entropy.
+def _functions_determining_entropy(system: System) -> dict[str, Energy]:
+    """Return the functions, by name, of which the entropy is a function: all Casimirs if known, or itself.
 
-    A quadratic entropy stands for itself too.
+    A quadratic entropy is always returned itself.
     """
-    S = _entropy_with_a_law(system)
+    S = _entropy_if_used(system)
     if S is None:
         return {}
     if S.is_quadratic or not system.orbit_levels.has_all_casimirs:
@@ -440,10 +443,11 @@ def _entropy_arguments(system: System) -> dict[str, Energy]:
     return system.casimirs()
 
 
-def _entropy_with_a_law(system: System) -> Energy | None:
-    """Return the entropy of a system; None if it has no law and no part in the motion, as under Lindblad jumps.
+def _entropy_if_used(system: System) -> Energy | None:
+    """Return the entropy of a system, or None if the entropy has no law and no influence on the motion.
 
-    A projection of the motion off its gradient would then only lower the order, where that gradient is infinite.
+    This holds for Lindblad jumps, for example. A projection of the motion off the gradient of this entropy would only
+    lower the order, where that gradient is infinite.
     """
     dissipation = system.total_dissipation
     has_no_part = dissipation.has_generator and not dissipation.needs_entropy
@@ -453,7 +457,7 @@ def _entropy_with_a_law(system: System) -> Energy | None:
 def _gradient_projector(
     system: System, u, gradients: list[StageGradients], n_components: int | None = None
 ) -> Callable:
-    """Return the orthogonal projector off the vectors of discrete gradients; the clock of a driven system is not moved.
+    """Return the orthogonal projector off the given discrete gradients, which does not move the clock of the system.
 
     Only the first ``n_components`` components are projected: Pi moves no bath, and its rounding must not either.
     """

@@ -105,8 +105,10 @@ class DiscreteHerglotz(OneStepMethod):
             callable(lagrangian) and not isinstance(lagrangian, Energy) and required_argument_count(lagrangian) == 3
         )
         return cls(
-            _Midpoint(
-                lagrangian if has_three_arguments else _EnergyOfArguments(make_energy(lagrangian, "the Lagrangian"))
+            _MidpointAction(
+                lagrangian
+                if has_three_arguments
+                else _LagrangianOfThreeArguments(make_energy(lagrangian, "the Lagrangian"))
             ),
             order,
         )
@@ -132,7 +134,7 @@ class DiscreteHerglotz(OneStepMethod):
             checked_numbers(S0, "S0", ()),
             checked_step_size(h),
         )
-        self._check_action(q0.shape)
+        self._check_discrete_lagrangian(q0.shape)
         p1 = jax.grad(self.discrete_lagrangian, argnums=1)(q0, q1, S0, h)
         return jnp.concatenate([q1, p1, (S0 + jnp.dot(q1 - q0, p1))[None]])
 
@@ -142,13 +144,17 @@ class DiscreteHerglotz(OneStepMethod):
         if not isinstance(system, EvolutionSystem):
             raise InputError(f"DiscreteHerglotz needs an lt.EvolutionSystem, got a {system.kind}")
         space = system.configurations
-        self._check_action((system.dim // 2,) if space is None else space.shape)
+        self._check_discrete_lagrangian((system.dim // 2,) if space is None else space.shape)
 
-    def _check_action(self, shape: tuple[int, ...]) -> None:
-        """Raise FunctionError unless the action of a step, at positions of this shape, is a number."""
-        arguments_text = f"(q_0, q_1, S_0, h), q_0 and q_1 of shape {shape}"
+    def _check_discrete_lagrangian(self, position_shape: tuple[int, ...]) -> None:
+        """Raise FunctionError unless the discrete Lagrangian returns a number for positions of this shape."""
+        arguments_text = f"(q_0, q_1, S_0, h), q_0 and q_1 of shape {position_shape}"
         traced_function_and_shape(
-            self.discrete_lagrangian, [shape, shape, (), ()], [()], "the discrete Lagrangian", arguments_text
+            self.discrete_lagrangian,
+            [position_shape, position_shape, (), ()],
+            [()],
+            "the discrete Lagrangian",
+            arguments_text,
         )
 
     def weights(self, theta) -> np.ndarray:
@@ -162,9 +168,9 @@ class DiscreteHerglotz(OneStepMethod):
         system = _unembedded_system(system)
         assert isinstance(system, EvolutionSystem)
         space, y, slopes, n = system.configurations, x + compensation, [], len(x) // 2
-        action = self.discrete_lagrangian if space is None else _ActionOfPoints(self.discrete_lagrangian, space)
+        action = self.discrete_lagrangian if space is None else _ActionOfFlatArrays(self.discrete_lagrangian, space)
         for (fraction, is_forward), guess in zip(SUBSTEPS[self.composed], k, strict=True):
-            slope = (_scheme_slope if is_forward else _adjoint_slope)(
+            slope = (_forward_substep_slope if is_forward else _adjoint_substep_slope)(
                 action, system.contact, y, fraction * h, guess[:n]
             )
             slopes.append(slope)
@@ -178,8 +184,8 @@ class DiscreteHerglotz(OneStepMethod):
         return apply_increment(self, system, x, compensation, self.increment(h, k), ends_on_surface=True)
 
 
-def _scheme_slope(action: Callable, contact: mf.SplitContact, y, h, guess) -> jax.Array:
-    """Return the slope of a substep by (40) and (41), after one step of Newton's method for its velocity."""
+def _forward_substep_slope(action: Callable, contact: mf.SplitContact, y, h, guess) -> jax.Array:
+    """Return the slope of a forward substep, by (40) and (41), after one step of Newton's method for its velocity."""
     n = len(guess)
     q, p, S = y[:n], y[n : 2 * n], y[2 * n]
 
@@ -193,19 +199,19 @@ def _scheme_slope(action: Callable, contact: mf.SplitContact, y, h, guess) -> ja
     return jnp.concatenate([velocity, (p1 - p) / h, jnp.dot(velocity, p1)[None]])
 
 
-def _adjoint_slope(action: Callable, contact: mf.SplitContact, y, h, guess) -> jax.Array:
-    """Return the slope of a substep by the adjoint scheme, after one step of Newton's method for its velocity."""
+def _adjoint_substep_slope(action: Callable, contact: mf.SplitContact, y, h, guess) -> jax.Array:
+    """Return the slope of a substep of the adjoint scheme, after one step of Newton's method for its velocity."""
     n = len(guess)
     q, p, S = y[:n], y[n : 2 * n], y[2 * n]
 
-    def adjoint_arguments(q1):
+    def backward_action_arguments(q1):
         return q1, q, S + jnp.dot(q1 - q, p), -h
 
     velocity = _newton_velocity(
-        lambda q1: jax.grad(action, argnums=1)(*adjoint_arguments(q1)) - p, contact, q, h, guess
+        lambda q1: jax.grad(action, argnums=1)(*backward_action_arguments(q1)) - p, contact, q, h, guess
     )
     q1 = q + h * velocity
-    dL_dq, dL_dS = jax.grad(action, argnums=(0, 2))(*adjoint_arguments(q1))
+    dL_dq, dL_dS = jax.grad(action, argnums=(0, 2))(*backward_action_arguments(q1))
     p1 = contact.tangential_part(q1, -dL_dq / (1.0 + dL_dS))
     return jnp.concatenate([velocity, (p1 - p) / h, jnp.dot(velocity, p)[None]])
 
@@ -216,22 +222,23 @@ def _newton_velocity(residual: Callable, contact: mf.SplitContact, q, h, velocit
     if isinstance(contact.bundle, mf.TangentBundle):
         surface, mass = ConstraintSurface(contact.bundle.base, tangent=True), jnp.max(jnp.abs(A))
 
-        def distance_from_manifold(v):  # times a mass, so that it is a momentum
+        def scaled_distance_from_manifold(v):  # times a mass, so that it is a momentum
             return mass * surface._correction_displacement(q, surface._constraint_change(q, 0.0, h * v) / h)
 
         A = jax.vmap(lambda column: contact.tangential_part(q, column), in_axes=1, out_axes=1)(A) + jax.jacfwd(
-            distance_from_manifold
+            scaled_distance_from_manifold
         )(velocity_guess)
-        residual_value = contact.tangential_part(q, residual_value) + distance_from_manifold(velocity_guess)
+        residual_value = contact.tangential_part(q, residual_value) + scaled_distance_from_manifold(velocity_guess)
     return velocity_guess - solve(A, residual_value[:, None])[:, 0]
 
 
 def _unembedded_system(system: System) -> System:
+    """Return the system on a manifold that an embedded system wraps; any other system unchanged."""
     return system.manifold if isinstance(system, EmbeddedSystem) else system
 
 
-class _ActionOfPoints(Module):
-    """An action of two points of a space, as a function of their flat arrays."""
+class _ActionOfFlatArrays(Module):
+    """A discrete Lagrangian of two points of a space, called with the flat arrays of the points."""
 
     action: Callable
     space: mf.Space = eqx.field(static=True)
@@ -240,15 +247,17 @@ class _ActionOfPoints(Module):
         return self.action(self.space.from_vector(q0), self.space.from_vector(q1), S0, h)
 
 
-class _Midpoint(Module):
+class _MidpointAction(Module):
+    """The discrete Lagrangian of the midpoint rule, h times a Lagrangian in the middle of a step."""
+
     lagrangian: Callable
 
     def __call__(self, q0, q1, S0, h):
         return h * self.lagrangian(0.5 * (q0 + q1), (q1 - q0) / h, S0)
 
 
-class _EnergyOfArguments(Module):
-    """An energy of (q, v, S) in one array, as a function of three arguments."""
+class _LagrangianOfThreeArguments(Module):
+    """A Lagrangian called with three arguments q, v and S, from an Energy of one array."""
 
     energy: Energy
 

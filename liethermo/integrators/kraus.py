@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..systems import DrivenSystem, QuantumSystem, System
 from .base import OneStepMethod, kind_or_class_name, register
 from .explicit import StepRow
-from .runge_kutta import END_SLOPE_ROW, weights_of_cubic
+from .runge_kutta import END_SLOPE_ROW, hermite_cubic_weights
 
 KRAUS_ORDERS = (2, 4)
 """Orders of :class:`KrausMethod`."""
@@ -107,14 +107,14 @@ class KrausMethod(OneStepMethod):
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         """Return the rows of :class:`.explicit.StepRow`, followed by the slopes at both ends."""
         x = x + compensation
-        body, n, clock_time = _quantum_body(system), _quantum_body(system).body_dim, None
+        body, n, clock_time = _undriven_quantum_system(system), _undriven_quantum_system(system).body_dim, None
         if isinstance(system, DrivenSystem):
             clock_time = system.time(x)
-        channel = _Channel.build(system, body.structure, clock_time, h, self.number)
+        channel = _StepChannel.build(system, body.structure, clock_time, h, self.number)
         middle, end = channel.apply(x[:n])
         d = end - x[:n]
         if isinstance(system, DrivenSystem):
-            d = jnp.concatenate([d, _clock_and_work(system, x, h, middle, end)])
+            d = jnp.concatenate([d, _clock_and_work_increments(system, x, h, middle, end)])
         field = jax.vmap(system.vector_field)(jnp.stack([x, x + d]))
         zero = jnp.zeros_like(x)
         return jnp.stack([d / h, zero, zero, k[StepRow.INITIAL_LEVELS], *field])
@@ -123,11 +123,11 @@ class KrausMethod(OneStepMethod):
         return h * k[StepRow.MEAN_SLOPE]
 
     def weights(self, theta) -> np.ndarray:
-        return weights_of_cubic(theta, self.stages)
+        return hermite_cubic_weights(theta, self.stages)
 
 
-class _Channel(NamedTuple):
-    """The completely positive map of a step.
+class _StepChannel(NamedTuple):
+    """The completely positive map of a step of Lindblad's equation.
 
     Attributes
     ----------
@@ -148,28 +148,28 @@ class _Channel(NamedTuple):
     propagators: dict
 
     @classmethod
-    def build(cls, system: System, structure: mf.DensityMatrices, time, h, order: int) -> _Channel:
-        """Return the map of a step of size h from time t; t is None if the system does not depend on time."""
-        body = _quantum_body(system)
+    def build(cls, system: System, structure: mf.DensityMatrices, time, h, order: int) -> _StepChannel:
+        """Return the channel of a step of size h from ``time``, which is None if the system does not depend on time."""
+        body = _undriven_quantum_system(system)
         fractions = (0.0, 0.25, 0.5, 1.0)
         frozen = dict.fromkeys(fractions, body)
         if time is not None:
             assert isinstance(system, DrivenSystem)
-            frozen = {c: _quantum_body(body.at_time(system.span.clip(time + c * h))) for c in fractions}
+            frozen = {c: _undriven_quantum_system(body.at_time(system.span.clip(time + c * h))) for c in fractions}
         terms = [term for term in body.total_dissipation.terms if isinstance(term, LindbladJumps)]
 
-        def operators(c) -> np.ndarray | jax.Array:
-            parts = [term.operators_at(frozen[c].time) for term in terms]
-            has_constants = all(isinstance(part, np.ndarray) for part in parts)
-            return np.concatenate(parts) if has_constants else jnp.concatenate(parts)
+        def operators(fraction) -> np.ndarray | jax.Array:
+            operator_arrays = [term.operators_at(frozen[fraction].time) for term in terms]
+            has_constants = all(isinstance(part, np.ndarray) for part in operator_arrays)
+            return np.concatenate(operator_arrays) if has_constants else jnp.concatenate(operator_arrays)
 
-        def rates(c) -> jax.Array:
-            return jnp.concatenate([term.rates_at(frozen[c].time) for term in terms])
+        def rates(fraction) -> jax.Array:
+            return jnp.concatenate([term.rates_at(frozen[fraction].time) for term in terms])
 
-        def decay_generator(c) -> jax.Array:
-            H = structure.matrix(frozen[c].energy.gradient(jnp.zeros(body.dim))[: structure.dim])
-            losses = adjoint(operators(c)) @ operators(c)
-            return -1j * H - 0.5 * jnp.tensordot(rates(c), jnp.asarray(losses), 1)
+        def decay_generator(fraction) -> jax.Array:
+            H = structure.matrix(frozen[fraction].energy.gradient(jnp.zeros(body.dim))[: structure.dim])
+            losses = adjoint(operators(fraction)) @ operators(fraction)
+            return -1j * H - 0.5 * jnp.tensordot(rates(fraction), jnp.asarray(losses), 1)
 
         intervals = [(0.0, 1.0)] if order == 2 else [(0.0, 0.25), (0.25, 0.5), (0.0, 0.5), (0.5, 1.0), (0.0, 1.0)]
         if time is None:
@@ -181,56 +181,64 @@ class _Channel(NamedTuple):
         return cls(structure, order, h, operators, rates, propagators)
 
     def apply(self, x) -> tuple[jax.Array, jax.Array]:
-        """Return the state in the middle of the step and at its end, shape (N^2,) each, from that at its start."""
+        """Apply the channel to a state x; return the states in the middle and at the end of the step, shape (N^2,)."""
         identity = self.structure.matrix(
-            jax.grad(lambda y: jnp.trace(self._map(self.structure.matrix(y))[1]).real)(jnp.zeros_like(x))
+            jax.grad(lambda y: jnp.trace(self._unnormalised_map(self.structure.matrix(y))[1]).real)(jnp.zeros_like(x))
         )
-        root = mf.spectral(_inverse_root, identity)
-        middle, end = self._map(root @ self.structure.matrix(x) @ root)
+        root = mf.spectral(_inverse_square_root, identity)
+        middle, end = self._unnormalised_map(root @ self.structure.matrix(x) @ root)
         return self.structure.vector(middle), self.structure.vector(end)
 
-    def _map(self, rho) -> tuple[jax.Array, jax.Array]:
-        """Return the middle and the end of a step before it is completed; by the trapezoidal rule for order 2."""
-        first_gain = self._gain(0.0, rho)
+    def _unnormalised_map(self, rho) -> tuple[jax.Array, jax.Array]:
+        """Return rho in the middle and at the end of a step, by quadrature, before the trace is normalised."""
+        start_gain = self._jump_gain(0.0, rho)
 
-        def second_order(c):  # the trapezoidal rule, with the state of order 1 at its end
-            W, step = self.propagators[0.0, c], c * self.h
-            without, gain = _conjugate(W, rho), _conjugate(W, first_gain)
-            return without + 0.5 * step * (gain + self._gain(c, without + step * gain))
+        def state_of_order_2(fraction):  # the trapezoidal rule, with the state of order 1 at its end
+            W, step = self.propagators[0.0, fraction], fraction * self.h
+            without, gain = _conjugate(W, rho), _conjugate(W, start_gain)
+            return without + 0.5 * step * (gain + self._jump_gain(fraction, without + step * gain))
 
         if self.order == 2:
-            end = second_order(1.0)
+            end = state_of_order_2(1.0)
             return 0.5 * (rho + end), end
 
-        def simpson(c, gain_in_the_middle, gain_at_the_end):
-            whole, second_half = self.propagators[0.0, c], self.propagators[0.5 * c, c]
-            gains = _conjugate(whole, first_gain), _conjugate(second_half, gain_in_the_middle), gain_at_the_end
-            return _conjugate(whole, rho) + c * self.h * sum(
+        def state_by_simpson(fraction, middle_gain, end_gain):
+            full_propagator, second_half_propagator = (
+                self.propagators[0.0, fraction],
+                self.propagators[0.5 * fraction, fraction],
+            )
+            gains = _conjugate(full_propagator, start_gain), _conjugate(second_half_propagator, middle_gain), end_gain
+            return _conjugate(full_propagator, rho) + fraction * self.h * sum(
                 weight * gain for weight, gain in zip(SIMPSON_WEIGHTS, gains, strict=True)
             )
 
-        quarter, half, end = (second_order(c) for c in (0.25, 0.5, 1.0))
-        half_gain = self._gain(0.5, half)
-        third_order_half = simpson(0.5, self._gain(0.25, quarter), half_gain)
-        third_order_end = simpson(1.0, half_gain, self._gain(1.0, end))
-        return third_order_half, simpson(1.0, self._gain(0.5, third_order_half), self._gain(1.0, third_order_end))
+        quarter, half, end = (state_of_order_2(c) for c in (0.25, 0.5, 1.0))
+        half_gain = self._jump_gain(0.5, half)
+        third_order_half = state_by_simpson(0.5, self._jump_gain(0.25, quarter), half_gain)
+        third_order_end = state_by_simpson(1.0, half_gain, self._jump_gain(1.0, end))
+        return third_order_half, state_by_simpson(
+            1.0, self._jump_gain(0.5, third_order_half), self._jump_gain(1.0, third_order_end)
+        )
 
-    def _gain(self, c: float, rho) -> jax.Array:
-        """Return ``sum rate V rho V^H`` at a fraction of the step."""
-        V = self.operators(c)
-        return jnp.sum(self.rates(c)[:, None, None] * (V @ rho @ adjoint(V)), axis=0)
+    def _jump_gain(self, fraction: float, rho) -> jax.Array:
+        """Return the gain of rho by jumps per unit of time, ``sum rate V rho V^H``, at a fraction of the step."""
+        V = self.operators(fraction)
+        return jnp.sum(self.rates(fraction)[:, None, None] * (V @ rho @ adjoint(V)), axis=0)
 
 
 def _conjugate(W, rho) -> jax.Array:
+    """Return ``W rho W^H``."""
     return W @ rho @ adjoint(W)
 
 
-def _inverse_root(p):
+def _inverse_square_root(p):
     return 1.0 / jnp.sqrt(p)
 
 
 def _magnus_exponents(J0, J, J1, h, intervals) -> list[jax.Array]:
-    """Return the exponents of W over parts of a step, of order 4, from ``-i H - ...`` at its start, middle and end.
+    """Return the exponents of Magnus' expansion of order 4 on intervals of a step, shape (N, N) each.
+
+    J0, J and J1 are the generator ``-i H - ...`` of the propagator W at the start, the middle and the end of the step.
 
     Over a step ``-i H - ...`` is replaced by a quadratic polynomial in time [Blanes et al. 2009].
     """
@@ -244,13 +252,14 @@ def _magnus_exponents(J0, J, J1, h, intervals) -> list[jax.Array]:
     return exponents
 
 
-def _quantum_body(system: System) -> QuantumSystem:
+def _undriven_quantum_system(system: System) -> QuantumSystem:
+    """Return the quantum system itself, or the one that a driven system wraps."""
     body = system.body if isinstance(system, DrivenSystem) else system
     assert isinstance(body, QuantumSystem)
     return body
 
 
-def _clock_and_work(system: DrivenSystem, x, h, middle, end) -> jax.Array:
+def _clock_and_work_increments(system: DrivenSystem, x, h, middle, end) -> jax.Array:
     """Return the increments of the clock and of the work in a step, shape (2,); Simpson's rule integrates the power."""
     states = jnp.stack([x[:-2], middle, end])
     times = x[-2] + jnp.array([0.0, 0.5, 1.0]) * h * system.unit

@@ -108,15 +108,15 @@ def project_onto_levels(
     d,
     target_changes,
     max_corrections: int = MAX_PROJECTION_ITERATIONS,
-    leaf: bool = False,
+    follow_leaf: bool = False,
     momentum_dim: int = 0,
 ) -> tuple[jax.Array, jax.Array]:
     """Return the displacement nearest to d with the required changes of the functions, and its residual as a length.
 
     ``start_gradients`` are the gradients of the functions at x + compensation, ``target_changes`` the required changes.
-    With ``leaf`` the displacement is along the symplectic leaf, and d is the covector that carries the state. The first
-    ``momentum_dim`` components are a momentum of constant length, which corrections leave at zero, and move less the
-    smaller it is.
+    With ``follow_leaf`` the displacement is along the symplectic leaf, and d is the covector that carries the state.
+    The first ``momentum_dim`` components are a momentum of constant length, which corrections leave at zero, and move
+    less the smaller it is.
 
     Near an equilibrium the entropy is almost the largest that the conserved functions allow. If a step overestimates
     the production, the levels may have no common point. Corrections along gradients that depend on each other would
@@ -129,17 +129,17 @@ def project_onto_levels(
     functions, blocks = [law.function for law in laws], system.state_blocks
 
     def corrected_displacement_and_residual(s: ProjectionState) -> tuple[jax.Array, jax.Array]:
-        d = s.d + correction_displacement(system, x + (compensation + s.d), s.correction, leaf, momentum_dim)
+        d = s.d + correction_displacement(system, x + (compensation + s.d), s.correction, follow_leaf, momentum_dim)
         return (d, jnp.zeros(())) if surface is None else surface.project_displacement(x, compensation, d)
 
     def change_vectors_at(state, gradients) -> list[jax.Array]:
-        """Return the vectors whose products with a displacement are the changes of the functions."""
-        if leaf:
+        """Return the vectors whose inner products with a displacement are the changes of the functions."""
+        if follow_leaf:
             return [system.raise_index(state, v) for v in gradients]
         return correction_directions(system, state, gradients)
 
-    def largest_changes(change_vectors, d) -> jax.Array:
-        """Return the largest change of each function in a displacement with the length of d in each block."""
+    def max_possible_changes(change_vectors, d) -> jax.Array:
+        """Return the largest change of each function in any displacement whose blocks are as long as those of d."""
         return jnp.stack([sum(jnp.linalg.norm(v[b]) * jnp.linalg.norm(d[b]) for b in blocks) for v in change_vectors])
 
     def change_gradient(f: Energy, d, start_gradient, end_gradient) -> jax.Array:
@@ -157,7 +157,7 @@ def project_onto_levels(
         return target_changes - jnp.stack([jnp.dot(gradient, d) for gradient in gradients])
 
     def apply_correction(s: ProjectionState) -> tuple[ProjectionState, list]:
-        """Apply the correction, and return the state with its new residuals and the gradients there."""
+        """Apply the next correction of a projection; return its state with new residuals, and the gradients there."""
         d, surface_residual = corrected_displacement_and_residual(s)
         end_gradients = [f.gradient(x + (compensation + d)) for f in functions]
         return s._replace(
@@ -185,14 +185,14 @@ def project_onto_levels(
         heat.
         """
         end_state = x + (compensation + s.d)
-        directions = correction_directions(system, end_state, end_gradients, leaf, momentum_dim)
-        is_same = not leaf and not momentum_dim
+        directions = correction_directions(system, end_state, end_gradients, follow_leaf, momentum_dim)
+        is_same = not follow_leaf and not momentum_dim
         change_vectors = directions if is_same else change_vectors_at(end_state, end_gradients)
         if len(blocks) == 1:
             lengths = jnp.stack([jnp.linalg.norm(v) for v in change_vectors])
         else:
             step_length = jnp.linalg.norm(s.d)
-            max_changes = largest_changes(change_vectors, s.d)
+            max_changes = max_possible_changes(change_vectors, s.d)
             products = jnp.abs(jnp.stack(change_vectors) @ jnp.stack(change_vectors).T)
             squares = jnp.diagonal(products)
             rounding_ratios = products / jnp.where(
@@ -204,8 +204,10 @@ def project_onto_levels(
         if work_direction is None:
             correction = level_correction(system, directions, s.level_residual)
         else:
-            start_lengths = largest_changes(start_vectors, s.d) / jnp.maximum(jnp.linalg.norm(s.d), VANISHED_LENGTH)
-            is_unreachable = is_level_unreachable(s, largest_changes(change_vectors, s.d))
+            start_lengths = max_possible_changes(start_vectors, s.d) / jnp.maximum(
+                jnp.linalg.norm(s.d), VANISHED_LENGTH
+            )
+            is_unreachable = is_level_unreachable(s, max_possible_changes(change_vectors, s.d))
             lengths = jnp.maximum(lengths, MIN_MEAN_GRADIENT * start_lengths)
             work = s.level_residual * jnp.stack([jnp.dot(v, work_direction) for v in end_gradients])
             correction = level_correction(system, directions, jnp.where(is_unreachable, 0.0, s.level_residual))
@@ -218,7 +220,7 @@ def project_onto_levels(
         The gradient of a function then nearly vanishes at the end of the step, and Newton's correction of the residual
         would be longer than half of the distance to the rest. A step that is too long for its residual is no such step.
         """
-        changes, residual = largest_changes(start_vectors, s.d), jnp.abs(s.level_residual)
+        changes, residual = max_possible_changes(start_vectors, s.d), jnp.abs(s.level_residual)
         is_out_of_reach = 4.0 * residual * changes > end_changes**2
         return (end_changes < MIN_MEAN_GRADIENT * changes) & is_out_of_reach & (residual <= MAX_WORK_RTOL * changes)
 
@@ -255,7 +257,7 @@ def project_onto_levels(
         return (s, is_finished | is_converged(s)), None
 
     def residual_length(s: ProjectionState, rounding) -> jax.Array:
-        """Return the residual beyond rounding, as a length, shape ()."""
+        """Return the level residual beyond rounding, converted to a length, shape ()."""
         has_vanished, excess = (
             s.direction_lengths <= VANISHED_LENGTH,
             jnp.maximum(jnp.abs(s.level_residual) - rounding, 0.0),
@@ -284,7 +286,7 @@ def project_onto_levels(
             second_difference = jnp.linalg.norm(start_gradient + end_gradient - 2.0 * middle)
             return second_difference > CURVATURE_SWITCH * jnp.linalg.norm(middle)
 
-        def function_rounding(f: Energy, start_gradient) -> jax.Array:
+        def rounding_of_function_change(f: Energy, start_gradient) -> jax.Array:
             end_gradient = f.gradient(begin + d)
             change = jnp.linalg.norm(end_gradient - start_gradient)
             uses_values = is_long | (change > MIN_GRADIENT_VARIATION * jnp.linalg.norm(start_gradient))
@@ -301,14 +303,16 @@ def project_onto_levels(
                 rounding += PRODUCT_RTOL * products
             return rounding
 
-        return jnp.stack([function_rounding(f, start) for f, start in zip(functions, start_gradients, strict=True)])
+        return jnp.stack(
+            [rounding_of_function_change(f, start) for f, start in zip(functions, start_gradients, strict=True)]
+        )
 
     start_vectors: list[jax.Array] = []
     if work_direction is not None:
         begin = x + compensation
         start_vectors = change_vectors_at(begin, start_gradients)
     zero_residual = jnp.zeros(len(laws))
-    start_d, start_correction = (jnp.zeros_like(d), -d) if leaf else (d, jnp.zeros_like(d))
+    start_d, start_correction = (jnp.zeros_like(d), -d) if follow_leaf else (d, jnp.zeros_like(d))
     s = with_next_correction(
         *apply_correction(ProjectionState(start_d, jnp.zeros(()), zero_residual, zero_residual, start_correction))
     )
@@ -320,13 +324,13 @@ def project_onto_levels(
     can_be_released = n_conserved < len(laws) and (n_conserved > 0 or surface is not None)
     n_iterations = max_corrections - 1 + (MAX_RELAXED_ITERATIONS + 1 if can_be_released else 0)
 
-    def correct_further() -> tuple[ProjectionState, jax.Array]:
+    def iterate_corrections() -> tuple[ProjectionState, jax.Array]:
         s_further, _ = jax.lax.scan(
             correct_unless_finished, (with_next_correction(s, last_gradients), has_converged), jnp.arange(n_iterations)
         )[0]
         return s_further, is_converged(s_further)
 
-    s, has_converged = jax.lax.cond(has_converged, lambda: (s, has_converged), correct_further)
+    s, has_converged = jax.lax.cond(has_converged, lambda: (s, has_converged), iterate_corrections)
     rounding = jax.lax.cond(
         has_converged, lambda: jnp.zeros_like(s.level_residual), lambda: level_residual_rounding(s.d)
     )
@@ -334,17 +338,17 @@ def project_onto_levels(
 
 
 def correction_directions(
-    system: System, x, gradients: Sequence[jax.Array], leaf: bool = False, momentum_dim: int = 0
+    system: System, x, gradients: Sequence[jax.Array], follow_leaf: bool = False, momentum_dim: int = 0
 ) -> list[jax.Array]:
     """Return the directions, along the surface, in which functions with these gradients at x are corrected.
 
-    With ``leaf`` they are directions of the covectors that carry the state along its leaf. The first ``momentum_dim``
-    components are a momentum of constant length: see :func:`_momentum_weights`.
+    With ``follow_leaf`` they are directions of the covectors that carry the state along its leaf. The first
+    ``momentum_dim`` components are a momentum of constant length: see :func:`_small_momentum_weights`.
     """
     if momentum_dim:
-        weights = _momentum_weights(system, x, momentum_dim)
+        weights = _small_momentum_weights(system, x, momentum_dim)
         gradients = [weights * gradient for gradient in gradients]
-    if leaf:
+    if follow_leaf:
         gradients = [_symplectic_leaf_direction(system, x, gradient) for gradient in gradients]
     directions, surface = [system.raise_index(x, gradient) for gradient in gradients], system.surface
     return directions if surface is None else [surface.project_direction(x, v) for v in directions]
@@ -367,22 +371,24 @@ def level_correction(
     return vector_with_inner_products(directions, changes, min(len(system.state_blocks), 2), is_usable)
 
 
-def correction_displacement(system: System, x, correction, leaf: bool = False, momentum_dim: int = 0) -> jax.Array:
+def correction_displacement(
+    system: System, x, correction, follow_leaf: bool = False, momentum_dim: int = 0
+) -> jax.Array:
     """Return the displacement of x by a correction: the correction itself, or along a leaf that of its covector.
 
     The covector is minus the correction: ``dH . Pi K = -(Pi dH) . K`` gives its sign.
     """
-    if leaf:
+    if follow_leaf:
         return system.poisson.leaf_displacement(x, -correction)
-    return _momentum_weights(system, x, momentum_dim) * correction if momentum_dim else correction
+    return _small_momentum_weights(system, x, momentum_dim) * correction if momentum_dim else correction
 
 
-def _momentum_weights(system: System, x, momentum_dim: int) -> jax.Array:
-    """Return factors of the gradients and of a correction, shape (n,), for a momentum of constant length.
+def _small_momentum_weights(system: System, x, momentum_dim: int) -> jax.Array:
+    """Return weights of the components, shape (n,), that vanish on a momentum near zero: a correction moves it less.
 
-    The first ``momentum_dim`` components are the momentum. Near zero the gradient of its length vanishes, so nothing
-    else keeps a correction of the energy from moving it by more than its own length. The factor of its components
-    falls with its length, to zero at zero.
+    The first ``momentum_dim`` components are the momentum, of constant length. Near zero the gradient of its length
+    vanishes, so nothing else keeps a correction of the energy from moving it by more than its own length. The factor of
+    its components falls with its length, to zero at zero.
     """
     momentum, state = (jnp.linalg.norm(x[:n]) for n in (momentum_dim, system.body_dim))
     ratio = momentum / jnp.where(state > 0.0, state, 1.0)

@@ -133,7 +133,7 @@ class WithAttitude(MethodWrapper):
 
     def initial_compensation(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
         mu, g = system.split_state(x)
-        attitude_correction = _group_correction(system.group, g) if self.kind == "cayley" else jnp.zeros_like(g)
+        attitude_correction = _correction_onto_group(system.group, g) if self.kind == "cayley" else jnp.zeros_like(g)
         momentum = jnp.zeros_like(system.spatial_impulse(x)) if system.torque_laws.name else None
         return system.join_state(self.method.initial_compensation(system.body, mu), attitude_correction, momentum)
 
@@ -155,7 +155,7 @@ class WithAttitude(MethodWrapper):
             dg = (g + g_compensation) @ _collocation_increment(system.group.algebra.hat(xi))
             new_g, new_g_compensation = two_sum(g, g_compensation + dg)
             return system.join_state(new_mu, new_g, p), system.join_state(
-                new_mu_compensation, new_g_compensation + _group_correction(system.group, new_g), p_compensation
+                new_mu_compensation, new_g_compensation + _correction_onto_group(system.group, new_g), p_compensation
             )
         new_g = system.group.restore_map(g @ self._attitude_increment(system.group, xi))
         return system.join_state(new_mu, new_g, p), system.join_state(
@@ -200,7 +200,7 @@ class WithAttitude(MethodWrapper):
         if self.kind == "coadjoint":
             return self._coadjoint_increment(group, stage_angles)
         return group.exp_map(
-            group.algebra, gauss_tableau(len(stage_angles)).b @ self._algebra_slopes(group.algebra, stage_angles)
+            group.algebra, gauss_tableau(len(stage_angles)).b @ self._munthe_kaas_slopes(group.algebra, stage_angles)
         )
 
     def _stage_attitudes(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:
@@ -215,7 +215,9 @@ class WithAttitude(MethodWrapper):
             * self._transporting_method.stage_velocities(system.body, mu, mu_compensation, h, k)[:, : system.group.dim]
         )
         if self.kind == "exp" or (self.kind == "coadjoint" and len(xi) > 1):
-            return g @ group.exp_map(group.algebra, gauss_tableau(len(xi)).A @ self._algebra_slopes(group.algebra, xi))
+            return g @ group.exp_map(
+                group.algebra, gauss_tableau(len(xi)).A @ self._munthe_kaas_slopes(group.algebra, xi)
+            )
         if self.kind == "cayley":
             attitudes = (g + g_compensation) @ _collocation_stages(group.algebra.hat(xi))
         else:
@@ -267,8 +269,10 @@ class WithAttitude(MethodWrapper):
         )
         return group.adjoint_cayley_map(algebra, x)
 
-    def _algebra_slopes(self, algebra, stage_angles) -> jax.Array:
-        """Return h times the stage slopes of collocation in the algebra, for angles h xi, shape (stages, dim).
+    def _munthe_kaas_slopes(self, algebra, stage_angles) -> jax.Array:
+        """Return h times the stage slopes of Munthe-Kaas collocation in the algebra, for angles h xi.
+
+        They have the shape (stages, dim), as ``stage_angles`` has.
 
         Each sweep of the iteration gains a power of h; there is one more sweep than the order needs.
         """
@@ -314,8 +318,8 @@ RESTORE_FRACTION = 2.0**-6
 """Fraction of the correction to the group that a step applies where the correction is mere rounding of the entries."""
 
 
-def _group_correction(group, g) -> jax.Array:
-    """Return the correction that brings an attitude back to its group.
+def _correction_onto_group(group, g) -> jax.Array:
+    """Return the correction, to be added, that brings an attitude g back to its group.
 
     A correction of the size of rounding is no error of the step, since the compensation holds the rounding. Applied in
     full at every step it would add up, in one direction while the body spins steadily: to 1e-12 in 1e6 steps.
@@ -336,7 +340,7 @@ step is taken."""
 
 
 def _project_onto_orbit(momentum_system, p, mu) -> jax.Array:
-    """Return the momentum near p with the Casimirs of the state mu; momenta of internal parts are unchanged."""
+    """Return the spatial momentum nearest to p with the Casimirs of mu; momenta of internal parts are unchanged."""
     n = len(p)
     scale = jnp.max(jnp.abs(mu[:n]))
     scale, casimirs = jnp.where(scale > 0.0, scale, 1.0), momentum_system.momentum_casimirs().values()

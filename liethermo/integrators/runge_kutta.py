@@ -28,7 +28,7 @@ QUADRATURE_ERROR_ROW = StepRow.FIRST_METHOD_ROW + 2
 """Row of ``k`` that holds the estimate of the error of a quadrature, over h."""
 
 
-def weights_of_cubic(theta, n_rows: int) -> np.ndarray:
+def hermite_cubic_weights(theta, n_rows: int) -> np.ndarray:
     """Return the weights of the cubic through both ends of a step and their slopes; its error in the step is O(h^4).
 
     Parameters
@@ -130,7 +130,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
         It misses the levels by the square of the error before the correction, O(h^{2p+2}): far below what a fit
         notices. Its program is short, and so are the programs of its derivatives.
         """
-        laws, t = self._laws(system), self.tableau
+        laws, t = self._laws_to_hold(system), self.tableau
 
         @jax.checkpoint  # recomputing is faster than storing from step to step, and the program is shorter
         def field_and_law_rates(x) -> tuple[jax.Array, jax.Array]:
@@ -162,18 +162,18 @@ class MetriplecticRungeKutta(ExplicitMethod):
         t = self.tableau
         s = len(t.b)
 
-        def stage(slopes, index_and_weights):
+        def evaluate_stage(slopes, index_and_weights):
             i, weights = index_and_weights
             slope, changes = rates(x + (compensation + h * (weights @ slopes)))
             return jax.lax.dynamic_update_index_in_dim(slopes, slope, i, 0), changes
 
-        return jax.lax.scan(stage, jnp.zeros((s, x.shape[0])), (np.arange(s), t.A))
+        return jax.lax.scan(evaluate_stage, jnp.zeros((s, x.shape[0])), (np.arange(s), t.A))
 
     def weights(self, theta) -> np.ndarray:
-        return weights_of_cubic(theta, self.stages)
+        return hermite_cubic_weights(theta, self.stages)
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
-        """Return the larger one of the two estimates of :class:`.tableaus.ExplicitTableau`."""
+        """Return the larger one of two error estimates, one for linear equations and one for quadratures."""
         t, step_length = self.tableau, h * jnp.max(jnp.abs(k[StepRow.MEAN_SLOPE]))
 
         def estimated_error(estimate: ErrorEstimate, row: int) -> jax.Array:

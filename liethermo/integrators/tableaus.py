@@ -70,6 +70,7 @@ def kronrod_rule(stages: int) -> KronrodRule | None:
 
 
 def _extended_precision_tableau(stages: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return A, b and c of the Gauss method in extended precision."""
     x, b = _gauss_rule(stages)
     return _legendre_integrals(_legendre_values(stages, x)) @ _lagrange_coefficients(stages), b, (1 + x) / 2
 
@@ -92,6 +93,7 @@ def _lagrange_coefficients(stages: int) -> np.ndarray:
 
 
 def _lagrange_values(stages: int, theta) -> np.ndarray:
+    """Return the Lagrange polynomials of the Gauss nodes at theta, shape (..., s)."""
     return _legendre_values(stages, 2 * theta - 1)[..., :stages] @ _lagrange_coefficients(stages)
 
 
@@ -132,7 +134,7 @@ class ErrorEstimate(NamedTuple):
 
 
 class ExplicitTableau(NamedTuple):
-    """Stages ``X_i = x + h sum_j A_ij k_j`` and step ``x' = x + h sum_i b_i k_i``.
+    """Tableau of an explicit Runge-Kutta method: ``X_i = x + h sum_j A_ij k_j``, ``x' = x + h sum_i b_i k_i``.
 
     Attributes
     ----------
@@ -158,16 +160,16 @@ LOBATTO_ORDERS = (4, 6, 8)
 
 
 @functools.cache
-def lobatto_nodes_and_weights(nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes (with both ends) and weights on [0, 1]: exact to degree ``2 nodes - 3``, all weights positive."""
-    m = nodes - 1  # the inner nodes are the roots of P_m'
+def lobatto_nodes_and_weights(n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes (with both ends) and weights on [0, 1]: exact to degree ``2 n_nodes - 3``, all weights positive."""
+    m = n_nodes - 1  # the inner nodes are the roots of P_m'
     x = np.polynomial.legendre.Legendre.basis(m).deriv().roots().astype(np.longdouble)
     for _ in range(3):  # Newton's method from double precision
         values, previous_values = _legendre_value(m, x), _legendre_value(m - 1, x)
         slope = m * (previous_values - x * values) / (1 - x * x)
-        x = x - slope * (1 - x * x) / (2 * x * slope - m * nodes * values)
+        x = x - slope * (1 - x * x) / (2 * x * slope - m * n_nodes * values)
     x = np.concatenate([[-1], np.sort(x), [1]])
-    b = 1 / (m * nodes * _legendre_value(m, x) ** 2)
+    b = 1 / (m * n_nodes * _legendre_value(m, x) ** 2)
     return ((1 + x) / 2).astype(np.float64), b.astype(np.float64)
 
 
@@ -229,15 +231,15 @@ def rooted_tree_vectors(A: np.ndarray, order: int) -> dict[int, list[np.ndarray]
     return vectors
 
 
-def _forest_products(A, vectors, nodes: int, max_branch_nodes: int):
-    """Yield the products of branches with ``nodes`` nodes in total and at most ``max_branch_nodes`` in each branch."""
-    if nodes == 0:
+def _forest_products(A, vectors, n_nodes: int, max_branch_nodes: int):
+    """Yield the products of branches with ``n_nodes`` nodes in total, at most ``max_branch_nodes`` in each branch."""
+    if n_nodes == 0:
         yield np.ones(len(A))
         return
-    for branch_nodes in range(min(nodes, max_branch_nodes), 0, -1):
+    for branch_nodes in range(min(n_nodes, max_branch_nodes), 0, -1):
         for v in vectors[branch_nodes]:
-            for rest in _forest_products(A, vectors, nodes - branch_nodes, branch_nodes):
-                yield (A @ v) * rest
+            for remaining_product in _forest_products(A, vectors, n_nodes - branch_nodes, branch_nodes):
+                yield (A @ v) * remaining_product
 
 
 def _kutta_coefficients() -> tuple[np.ndarray, np.ndarray]:

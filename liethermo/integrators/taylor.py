@@ -33,7 +33,7 @@ DEFAULT_RTOL = 1e-10
 
 
 def order_for_tolerance(tolerance: float | None) -> int:
-    """Return the order for a relative tolerance [Jorba & Zou 2005]."""
+    """Return the order of a Taylor method for a relative tolerance, by default DEFAULT_RTOL [Jorba & Zou 2005]."""
     order = math.ceil(1.0 - 0.5 * math.log(DEFAULT_RTOL if tolerance is None else tolerance))
     return min(max(MIN_ORDER, order), MAX_ORDER)
 
@@ -122,19 +122,19 @@ class MetriplecticTaylor(ExplicitMethod):
                     f"{self} needs Taylor series, and of {name} ", "take lt.MetriplecticRungeKutta"
                 ) from None
         if system.space is not None and self.retraction is not None:
-            self._check_chart_series(system.space)
+            self._check_chart_has_taylor_series(system.space)
 
-    def _check_chart_series(self, space: mf.Space) -> None:
+    def _check_chart_has_taylor_series(self, space: mf.Space) -> None:
         """Raise TaylorSeriesError unless the map from coordinates of the chart to states has a Taylor series."""
         assert self.retraction is not None
         chart = resolve_retraction(space, self.retraction).chart
         z = space.random(0)
 
-        def point(c):
+        def state_from_coordinates(c):
             return space.to_vector(chart._point(z, space._from_coordinates(z, c)))
 
         try:
-            check_taylor_series(point, jnp.zeros(space.dim))
+            check_taylor_series(state_from_coordinates, jnp.zeros(space.dim))
         except TaylorSeriesError as error:
             raise error.add_context(
                 f"{self} needs Taylor series, and of {chart} ",

@@ -295,7 +295,7 @@ def _is_short(expression: Any) -> bool:
 
 def _to_sympy_number(value: Any) -> Any:
     if isinstance(value, bool | np.bool_):
-        return sympy.check_true if value else sympy.false
+        return sympy.true if value else sympy.false
     number = float(value)
     if not np.isfinite(number):
         return sympy.nan if number != number else sympy.oo * int(np.sign(number))

@@ -19,7 +19,7 @@ SPLINE_DEGREE = 5
 
 
 def parse_trajectories(data: Any, system: System, observation: Observation) -> list[Trajectory]:
-    """Return the trajectories in the user's data: pairs of times and observations, solutions, or a table with names.
+    """Convert the data of a fit to a list of checked trajectories; data are pairs (t, x), solutions, or a table.
 
     Raises
     ------
@@ -35,8 +35,9 @@ def parse_trajectories(data: Any, system: System, observation: Observation) -> l
     return trajectories
 
 
-def _columns_of_observation(records: Records, observation: Observation) -> list[Trajectory]:
-    """Return the columns of a table that are observed, by their names, or all of them in order if there are no names.
+def _select_observed_columns(records: Records, observation: Observation) -> list[Trajectory]:
+    """Return the trajectories of a table with the observed columns only: by name, or all if the observation has no
+    names.
 
     Raises
     ------
@@ -54,10 +55,17 @@ def _columns_of_observation(records: Records, observation: Observation) -> list[
 
 
 def _time_observation_pairs(data: Any, observation: Observation) -> list[tuple[Any, Any]]:
+    """Return the pairs (times, observations) in the data of a fit, one for each trajectory, without checking them.
+
+    Raises
+    ------
+    InputError
+        If data are not pairs, solutions, a table, or a sequence of these.
+    """
     if is_table(data):
         data = read_data(data, columns=observation.names or None)
     if isinstance(data, Records):
-        return list(_columns_of_observation(data, observation))
+        return list(_select_observed_columns(data, observation))
     if isinstance(data, Solution):
         return [(data.t, observation.observe_solution(data))]
     if isinstance(data, tuple) and len(data) == 2 and _ndim_or_none(data[0]) == 1:
@@ -87,8 +95,16 @@ def _real_array(values: Any) -> np.ndarray:
     return array.astype(np.float64)
 
 
-def _checked_trajectory(number: int, t, x, system: System, observation: Observation) -> Trajectory:
-    name_of_trajectory = f"trajectory {number}"
+def _checked_trajectory(trajectory_index: int, t, x, system: System, observation: Observation) -> Trajectory:
+    """Return a trajectory without the times at which nothing was observed, after checking its times and values.
+
+    Raises
+    ------
+    InputError
+        If values are not finite real numbers (NaN is a missing observation), times do not increase, shapes do not match
+        the observation, or a component has no values.
+    """
+    name_of_trajectory = f"trajectory {trajectory_index}"
     try:
         t, x = _real_array(t), _real_array(x)
     except (TypeError, ValueError) as error:
@@ -146,9 +162,9 @@ def _checked_trajectory(number: int, t, x, system: System, observation: Observat
     return Trajectory(t, x)
 
 
-def _column_values(trajectory: Trajectory, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times and the values of a component without the missing ones."""
-    values = trajectory.x[:, k]
+def _present_values_of_component(trajectory: Trajectory, component: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times and values at which a component of a trajectory is not missing, shape (p,) each."""
+    values = trajectory.x[:, component]
     is_present = np.isfinite(values)
     return trajectory.t[is_present], values[is_present]
 
@@ -168,21 +184,28 @@ class DataScales(NamedTuple):
     scale: np.ndarray
     time_scale: float
 
-    def extend_to_states(self, indices: np.ndarray, states: np.ndarray) -> DataScales:
-        """Return the scales of full states: those of the data at ``indices``, and those computed from ``states``
-        elsewhere.
+    def extend_to_states(self, observed_indices: np.ndarray, states: np.ndarray) -> DataScales:
+        """Return the scales of all state components: observed components keep those of the data, the others get those
+        of ``states``.
 
         A component that does not vary has centre 0 and scale 1.
         """
         centre, scale = states.mean(axis=0), states.std(axis=0)
         centre, scale = np.where(scale > 0.0, centre, 0.0), np.where(scale > 0.0, scale, 1.0)
-        centre[indices], scale[indices] = self.centre[: len(indices)], self.scale[: len(indices)]
+        centre[observed_indices], scale[observed_indices] = (
+            self.centre[: len(observed_indices)],
+            self.scale[: len(observed_indices)],
+        )
         return DataScales(centre, scale, self.time_scale)
 
 
-def data_scales(data: list[Trajectory]) -> DataScales:
-    """Return the mean and standard deviation of all trajectories together, and the time scale of their changes."""
-    columns = [[_column_values(trajectory, k) for trajectory in data] for k in range(data[0].x.shape[1])]
+def component_and_time_scales(trajectories: list[Trajectory]) -> DataScales:
+    """Return the mean and standard deviation of each component over all trajectories, and the median time scale of the
+    changes."""
+    columns = [
+        [_present_values_of_component(trajectory, k) for trajectory in trajectories]
+        for k in range(trajectories[0].x.shape[1])
+    ]
     values = [np.concatenate([y for _, y in column]) for column in columns]
     centre, scale = np.array([y.mean() for y in values]), np.array([y.std() for y in values])
     scale = np.where(scale > 1e-12 * np.abs(centre), scale, np.where(centre != 0.0, np.abs(centre), 1.0))
@@ -194,14 +217,14 @@ def data_scales(data: list[Trajectory]) -> DataScales:
     return DataScales(centre, scale, 1.0 / float(np.median(positive_speeds)))
 
 
-def smooth_time_scale(rates: list[np.ndarray], scales: DataScales) -> float:
-    """Return the time in which the fastest number changes by its scale, from smooth rates of change, shape (m, k)."""
+def shortest_time_scale(rates: list[np.ndarray], scales: DataScales) -> float:
+    """Return the time in which the fastest component changes by its scale, from rates of change, shapes (m, k)."""
     speed = np.sqrt(np.mean((np.concatenate(rates) / scales.scale) ** 2, axis=0))
     return 1.0 / float(np.max(speed)) if (speed > 0.0).any() else scales.time_scale
 
 
 def spline_states_and_rates(trajectory: Trajectory, noise: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return states and rates of change at the times of a trajectory by a spline, shape (m, k) each.
+    """Fit a spline to a trajectory and return its values and derivatives at the times of the data, shape (m, k) each.
 
     Without noise the spline interpolates; with noise, standard deviations of shape (k,), it smooths by as much.
     """
@@ -221,10 +244,13 @@ def spline_states_and_rates(trajectory: Trajectory, noise: np.ndarray | None) ->
 
 
 def _splines_with_missing_values(trajectory: Trajectory, noise: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return states and rates by a spline through the values of each component, constant before and after them."""
+    """Fit splines to components with missing values; return their values and derivatives at all times, shape (m, k).
+
+    Before its first value and after its last one, a component is constant.
+    """
     states, rates = np.empty_like(trajectory.x), np.zeros_like(trajectory.x)
     for k in range(trajectory.x.shape[1]):
-        t, y = _column_values(trajectory, k)
+        t, y = _present_values_of_component(trajectory, k)
         if len(t) == 1:
             states[:, k] = y[0]
             continue
@@ -251,19 +277,19 @@ MIN_RELATIVE_NOISE = 1e-3
 """Noise, relative to the scale of the data, below which it is ignored."""
 
 
-def estimate_noise(data: list[Trajectory], scale: np.ndarray) -> np.ndarray | None:
-    """Return standard deviations of the errors of data, shape (k,), from their differences; None if no noise is
-    detected.
+def estimate_noise_if_visible(trajectories: list[Trajectory], scale: np.ndarray) -> np.ndarray | None:
+    """Estimate the standard deviation of the measurement noise of each component, shape (k,); return None if no noise
+    is visible.
 
     Divided differences of a smooth motion decrease with their order. Those of independent errors, with weights of norm
     one, do not.
     """
-    levels = noise_levels(data, scale)
+    levels = estimate_noise_levels(trajectories, scale)
     return levels.std if levels.is_noise.any() else None
 
 
 class NoiseLevels(NamedTuple):
-    """Errors of each component of the data, as their differences show them.
+    """Estimates of the measurement noise of each component, from divided differences of the data.
 
     Attributes
     ----------
@@ -280,26 +306,35 @@ class NoiseLevels(NamedTuple):
     is_bound: np.ndarray
 
 
-def noise_levels(data: list[Trajectory], scale: np.ndarray) -> NoiseLevels:
+def estimate_noise_levels(trajectories: list[Trajectory], scale: np.ndarray) -> NoiseLevels:
     """Estimate the standard deviation of the noise of each component, or an upper bound if no noise is visible."""
-    levels = np.array([_divided_difference_stds([_column_values(tr, k) for tr in data]) for k in range(len(scale))])
-    is_noise = (levels[:, -1] > NOISE_PLATEAU_RATIO * levels[:, -3]) & (levels[:, -1] > MIN_RELATIVE_NOISE * scale)
-    std = np.where(is_noise, levels[:, -3:].mean(axis=1), levels.min(axis=1))
-    return NoiseLevels(np.maximum(std, MIN_RELATIVE_NOISE * scale), is_noise, np.asarray(levels.any(axis=1)))
+    stds_by_order = np.array(
+        [
+            _noise_stds_by_difference_order(
+                [_present_values_of_component(trajectory, k) for trajectory in trajectories]
+            )
+            for k in range(len(scale))
+        ]
+    )
+    is_noise = (stds_by_order[:, -1] > NOISE_PLATEAU_RATIO * stds_by_order[:, -3]) & (
+        stds_by_order[:, -1] > MIN_RELATIVE_NOISE * scale
+    )
+    std = np.where(is_noise, stds_by_order[:, -3:].mean(axis=1), stds_by_order.min(axis=1))
+    return NoiseLevels(np.maximum(std, MIN_RELATIVE_NOISE * scale), is_noise, np.asarray(stds_by_order.any(axis=1)))
 
 
-def _divided_difference_stds(column: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """Return the standard deviation of normalised divided differences of each order, by their median; zeros if there
-    are too few."""
-    if sum(max(len(t) - DIFFERENCE_ORDERS[-1], 0) for t, _ in column) < MIN_DIFFERENCES:
+def _noise_stds_by_difference_order(component_values: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Estimate the noise of a component from its divided differences of each order; return zeros if there are too
+    few."""
+    if sum(max(len(t) - DIFFERENCE_ORDERS[-1], 0) for t, _ in component_values) < MIN_DIFFERENCES:
         return np.zeros(len(DIFFERENCE_ORDERS))
-    return np.array([_divided_difference_std(column, order) for order in DIFFERENCE_ORDERS])
+    return np.array([_noise_std_from_differences(component_values, order) for order in DIFFERENCE_ORDERS])
 
 
-def _divided_difference_std(column: list[tuple[np.ndarray, np.ndarray]], order: int) -> float:
-    """Return the standard deviation of normalised divided differences by their median."""
+def _noise_std_from_differences(component_values: list[tuple[np.ndarray, np.ndarray]], order: int) -> float:
+    """Estimate the noise of a component from the median of its normalised divided differences of one order."""
     differences = []
-    for t, y in column:
+    for t, y in component_values:
         if len(t) <= order:
             continue
         times = np.lib.stride_tricks.sliding_window_view(t, order + 1)
@@ -342,25 +377,26 @@ class Windows(NamedTuple):
     first_windows: np.ndarray
 
 
-def cut_windows(data: list[Trajectory], states: list[np.ndarray], length: int, is_disjoint: bool) -> Windows:
-    """Cut trajectories into windows of ``length`` intervals: consecutive ones if ``is_disjoint``, else one from each
-    point."""
-    length = min(length, *(len(t) - 1 for t, _ in data))
+def cut_windows(
+    trajectories: list[Trajectory], states: list[np.ndarray], n_intervals: int, is_disjoint: bool
+) -> Windows:
+    """Cut trajectories into windows of ``n_intervals`` time intervals: disjoint windows, or one from each time."""
+    n_intervals = min(n_intervals, *(len(t) - 1 for t, _ in trajectories))
     initial_states, intervals, observations, times = [], [], [], []
     next_window: list[int] = []
     first_windows = []
-    for (t, x), trajectory_states in zip(data, states, strict=True):
-        last_start = len(t) - 1 - length
-        window_starts = list(range(0, last_start + 1, length if is_disjoint else 1))
+    for (t, x), trajectory_states in zip(trajectories, states, strict=True):
+        last_start = len(t) - 1 - n_intervals
+        window_starts = list(range(0, last_start + 1, n_intervals if is_disjoint else 1))
         if window_starts[-1] != last_start:
             window_starts.append(last_start)
         first_windows.append(len(next_window))
         for i in window_starts:
-            has_next = is_disjoint and i + length in window_starts
+            has_next = is_disjoint and i + n_intervals in window_starts
             initial_states.append(trajectory_states[i])
-            intervals.append(np.diff(t[i : i + length + 1]))
-            observations.append(x[i : i + length + 1])
-            times.append(t[i : i + length + 1])
+            intervals.append(np.diff(t[i : i + n_intervals + 1]))
+            observations.append(x[i : i + n_intervals + 1])
+            times.append(t[i : i + n_intervals + 1])
             next_window.append(len(next_window) + 1 if has_next else -1)
     return Windows(
         np.stack(initial_states),

@@ -28,7 +28,7 @@ ADAM_EPSILON = 1e-8
 """Number added to the root of the mean squares, as in Adam."""
 
 
-def soap_optimiser(shapes: Sequence[tuple[int, ...]], rate: Callable) -> Any:
+def soap_optimiser(array_shapes: Sequence[tuple[int, ...]], learning_rate: Callable) -> Any:
     """Return the optax optimiser SOAP [Vyas et al. 2025] for a parameter vector.
 
     The gradient of a weight matrix W is rotated into the eigenvectors of the running means of ``G G^T`` and ``G^T G``,
@@ -37,17 +37,17 @@ def soap_optimiser(shapes: Sequence[tuple[int, ...]], rate: Callable) -> Any:
 
     Parameters
     ----------
-    shapes : sequence of tuple of int
+    array_shapes : sequence of tuple of int
         Shapes of the arrays at the start of the vector; the rest of the vector is one more array.
-    rate : function from the number of a step to a number
+    learning_rate : function from the number of a step to a number
         Learning rate.
     """
     import optax
 
-    ends = list(itertools.accumulate(map(math.prod, shapes)))
+    ends = list(itertools.accumulate(map(math.prod, array_shapes)))
     matrices = [
         (slice(end - math.prod(shape), end), shape)
-        for end, shape in zip(ends, shapes, strict=True)
+        for end, shape in zip(ends, array_shapes, strict=True)
         if len(shape) == 2 and min(shape) > 1 and max(shape) <= MAX_PRECONDITIONED_DIM
     ]
 
@@ -59,42 +59,43 @@ def soap_optimiser(shapes: Sequence[tuple[int, ...]], rate: Callable) -> Any:
 
     def init(vector):
         zero = jnp.zeros_like(vector)
-        sides = [[(jnp.eye(n), jnp.zeros((n, n))) for n in shape] for _, shape in matrices]
-        return jnp.zeros((), int), zero, zero, sides
+        bases_and_means = [[(jnp.eye(n), jnp.zeros((n, n))) for n in shape] for _, shape in matrices]
+        return jnp.zeros((), int), zero, zero, bases_and_means
 
     def update(gradient, state, vector=None):
-        count, mean, square, sides = state
+        count, mean, square, bases_and_means = state
         grams = [_gram_matrices(gradient[indices].reshape(shape)) for indices, shape in matrices]
         means = [
             [MEAN_DECAY * S + (1.0 - MEAN_DECAY) * P for (_, S), P in zip(pair, products, strict=True)]
-            for pair, products in zip(sides, grams, strict=True)
+            for pair, products in zip(bases_and_means, grams, strict=True)
         ]
         mean_decays, square_decays = mean_and_square_decays(gradient.size)
         rotated_slope, mean = (
-            _rotate_matrices(gradient, matrices, sides),
+            _rotate_matrices(gradient, matrices, bases_and_means),
             mean_decays * mean + (1.0 - mean_decays) * gradient,
         )
         square = square_decays * square + (1.0 - square_decays) * rotated_slope**2
-        step = _rotate_matrices(mean / (1.0 - mean_decays ** (count + 1.0)), matrices, sides)
+        step = _rotate_matrices(mean / (1.0 - mean_decays ** (count + 1.0)), matrices, bases_and_means)
         step = step / (jnp.sqrt(square / (1.0 - square_decays ** (count + 1.0))) + ADAM_EPSILON)
-        step = _rotate_matrices(step, matrices, [[(Q.T, S) for Q, S in pair] for pair in sides])
+        step = _rotate_matrices(step, matrices, [[(Q.T, S) for Q, S in pair] for pair in bases_and_means])
 
         def update_bases(_):
             return [[_update_eigenvectors(count, Q, S) for (Q, _), S in zip(pair, gram_means, strict=True)]
-                    for pair, gram_means in zip(sides, means, strict=True)]  # fmt: skip
+                    for pair, gram_means in zip(bases_and_means, means, strict=True)]  # fmt: skip
 
         def keep_bases(_):
-            return [[Q for Q, _ in pair] for pair in sides]
+            return [[Q for Q, _ in pair] for pair in bases_and_means]
 
         bases = jax.lax.cond(count % STEPS_PER_EIGENBASIS == 0, update_bases, keep_bases, None)
-        sides = [list(zip(*basis_and_mean, strict=True)) for basis_and_mean in zip(bases, means, strict=True)]
-        return -rate(count) * step, (count + 1, mean, square, sides)
+        bases_and_means = [list(zip(*basis_and_mean, strict=True)) for basis_and_mean in zip(bases, means, strict=True)]
+        return -learning_rate(count) * step, (count + 1, mean, square, bases_and_means)
 
     return optax.GradientTransformation(init, update)
 
 
-def _gram_matrices(G: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return G @ G.T, G.T @ G
+def _gram_matrices(gradient_matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the Gram matrices ``G G^T`` and ``G^T G`` of the gradient G by a weight matrix."""
+    return gradient_matrix @ gradient_matrix.T, gradient_matrix.T @ gradient_matrix
 
 
 def _rotate_matrices(vector: jax.Array, matrix_slices: Sequence, basis_pairs: Sequence) -> jax.Array:
@@ -104,6 +105,6 @@ def _rotate_matrices(vector: jax.Array, matrix_slices: Sequence, basis_pairs: Se
     return vector
 
 
-def _update_eigenvectors(count: jax.Array, Q: jax.Array, S: jax.Array) -> jax.Array:
+def _update_eigenvectors(n_steps: jax.Array, Q: jax.Array, S: jax.Array) -> jax.Array:
     """Return the eigenvectors of S: exact at step 0, then by one step of orthogonal iteration from Q."""
-    return jax.lax.cond(count == 0, lambda: jnp.linalg.eigh(S)[1][:, ::-1], lambda: jnp.linalg.qr(S @ Q)[0])
+    return jax.lax.cond(n_steps == 0, lambda: jnp.linalg.eigh(S)[1][:, ::-1], lambda: jnp.linalg.qr(S @ Q)[0])

@@ -35,7 +35,8 @@ JSON_FIELDS = (
 """Other fields of the record of a fit, stored in the JSON of the file."""
 
 
-def _split_arrays(system: Any) -> tuple[list[Any], Any, Any]:
+def _flatten_array_leaves(system: Any) -> tuple[list[Any], Any, Any]:
+    """Return the array leaves of a system, the tree structure of these, and the system with None in their place."""
     dynamic, static = eqx.partition(system, eqx.is_array)
     leaves, structure = jax.tree_util.tree_flatten(dynamic)
     return leaves, structure, static
@@ -43,7 +44,7 @@ def _split_arrays(system: Any) -> tuple[list[Any], Any, Any]:
 
 @with_library_settings
 def save(system: System, path: str | os.PathLike) -> Path:
-    """Write the arrays of a system, and the record of its fit, to a file that :func:`load` reads.
+    """Save the arrays of a system, and the record of its fit, to a file that :func:`load` reads.
 
     The file contains arrays and JSON, and no code. It is written atomically.
 
@@ -60,7 +61,7 @@ def save(system: System, path: str | os.PathLike) -> Path:
         If the file cannot be written.
     """
     path, training = Path(path), getattr(system, "training", None)
-    arrays = {f"leaf_{i}": np.asarray(leaf) for i, leaf in enumerate(_split_arrays(system)[0])}
+    arrays = {f"leaf_{i}": np.asarray(leaf) for i, leaf in enumerate(_flatten_array_leaves(system)[0])}
     metadata: dict[str, Any] = {"format": MODEL_FORMAT, "kind": system.kind}
     if training is not None:
         arrays |= {name: getattr(training, name) for name in CURVE_FIELDS}
@@ -88,7 +89,7 @@ def load(path: str | os.PathLike, system: T) -> T:
         If there is no such file, it is damaged, or it holds a system of another structure.
     """
     metadata, arrays = read_archive(Path(path), MODEL_FORMAT)
-    leaves, structure, static = _split_arrays(system)
+    leaves, structure, static = _flatten_array_leaves(system)
     saved_leaves = [
         arrays.get(f"leaf_{i}", np.zeros(0, bool)) for i in range(sum(n.startswith("leaf_") for n in arrays))
     ]

@@ -22,20 +22,32 @@ from ..units import quantity_in_si
 from . import losses
 from .data import (
     Trajectory,
+    component_and_time_scales,
     cut_windows,
-    data_scales,
-    noise_levels,
+    estimate_noise_levels,
     parse_trajectories,
-    smooth_time_scale,
+    shortest_time_scale,
     spline_states_and_rates,
 )
 from .least_squares import LeastSquaresProblem, fit_by_least_squares
 from .losses import Objective
-from .observation import default_states, make_observation, n_displacement_coordinates, states_matching_rates
-from .parameters import build_checked, initial_parameters, named_parameter_vector
+from .observation import (
+    make_observation,
+    n_displacement_coordinates,
+    states_from_observations,
+    states_matching_observations_and_rates,
+)
+from .parameters import build_with_parameters, initial_parameter_values, named_parameter_vector
 from .parts import has_learned_parts, scale_networks
-from .refining import MAX_PARAMETERS, RunModel, can_refine, pad_runs, refine_by_least_squares, whole_trajectories
-from .training import FitWarning, Phase, Training, TrainingRun, empty_training, fingerprint
+from .refining import (
+    MAX_PARAMETERS,
+    RunModel,
+    can_refine_by_least_squares,
+    pad_runs,
+    refine_by_least_squares,
+    segments_of_whole_trajectories,
+)
+from .training import FitWarning, Phase, Training, TrainingRun, fingerprint, training_without_descent
 
 T = TypeVar("T", bound=System)
 
@@ -177,8 +189,8 @@ def fit(
     >>> body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
     >>> run = lt.integrate(body, [0.3, 0.2, 1.0], (0.0, 2.0), 0.1, lt.MetriplecticGauss(3))
     >>> guess = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.3)
-    >>> found = lt.learn.fit(guess, run, parameters=["dissipation.rate"], positive=True)
-    >>> round(float(found.dissipation.rate / body.dissipation.rate), 4)
+    >>> fitted = lt.learn.fit(guess, run, parameters=["dissipation.rate"], positive=True)
+    >>> round(float(fitted.dissipation.rate / body.dissipation.rate), 4)
     1.0
     """
     start_time = time.perf_counter()
@@ -190,32 +202,32 @@ def fit(
     shooting = DEFAULT_ITERATIONS["shooting"] * (parameters is None) if shooting is None else shooting
     counts = {"matching": matching, "shooting": shooting, "batch": batch, "window": window, "substeps": substeps}
     for name, value in {**counts, "patience": patience, "seed": seed}.items():
-        optional = name in ("batch", "patience", "substeps")
-        _check_count(name, value, 0 if name in BATCH_SIZES or name == "seed" else 1, optional)
-    model, values, make_params = parameters_to_fit(system, parameters, also, positive)
+        is_optional = name in ("batch", "patience", "substeps")
+        _check_integer(name, value, 0 if name in BATCH_SIZES or name == "seed" else 1, is_optional)
+    model, values, make_params = prepare_system_and_parameters(system, parameters, also, positive)
     if model.is_driven:
         raise InputError("fit needs a system without torques, whose energy does not depend on time")
     observation = make_observation(model, observed, observe, values)
     method = MetriplecticRungeKutta(4) if method is None else method
     n_substeps = 1 if substeps is None else substeps
-    run = losses.differentiable_stepper(model, method, n_substeps, observation.group is not None).system
+    prepared_system = losses.differentiable_stepper(model, method, n_substeps, observation.group is not None).system
     trajectories = [trajectory.flat_trajectory for trajectory in parse_trajectories(data, model, observation)]
-    data_scale = data_scales(trajectories)
-    sigma = checked_noise(noise, data_scale.scale.size)
+    data_scale = component_and_time_scales(trajectories)
+    sigma = checked_noise_std(noise, data_scale.scale.size)
     noise_is_estimated = noise is None
-    levels = None
+    noise_levels = None
     if noise_is_estimated:
-        levels = noise_levels(trajectories, data_scale.scale)
-        sigma = levels.std if levels.is_noise.any() else None
+        noise_levels = estimate_noise_levels(trajectories, data_scale.scale)
+        sigma = noise_levels.std if noise_levels.is_noise.any() else None
     smoothed_trajectories = [spline_states_and_rates(trajectory, sigma) for trajectory in trajectories]
     if observation.is_full_state or has_learned_parts(model):
-        starts = [default_states(observation, run, x) for x, _ in smoothed_trajectories]
+        starts = [states_from_observations(observation, prepared_system, x) for x, _ in smoothed_trajectories]
     else:
         times_and_smoothed = [
             (t, *smoothed) for (t, _), smoothed in zip(trajectories, smoothed_trajectories, strict=True)
         ]
-        starts = states_matching_rates(
-            observation, run, times_and_smoothed, data_scale.scale, data_scale.time_scale, values
+        starts = states_matching_observations_and_rates(
+            observation, prepared_system, times_and_smoothed, data_scale.scale, data_scale.time_scale, values
         )
     states = np.concatenate(starts)
     state_scale = data_scale.extend_to_states(observation.component_indices, states[:, : model.dim])
@@ -233,18 +245,18 @@ def fit(
         )
     default_fraction = 0.2 if observation.is_full_state and matching + shooting else 0.0
     held_out_fraction = default_fraction if validation is None else validation
-    training_data, held_out_data = _split_training_and_held_out(
+    training_data, held_out_data = _split_off_held_out_data(
         list(zip(trajectories, starts, strict=True)), held_out_fraction, seed
     )
 
-    def units_for(sigma: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the units of the observations, of the search for initial states, and of gaps between runs."""
+    def units_for_noise(sigma: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the units of the observations, of the displacements of initial states, and of gaps between runs."""
         relative_noise = 1.0 if sigma is None else float(np.sqrt(np.mean((sigma / data_scale.scale) ** 2)))
         search_units = state_scale.scale.copy()
         if sigma is not None and len(observation.component_indices):
             search_units[observation.component_indices] = sigma
-        attitude_search_units = relative_noise * np.ones(n_displacement_coordinates(run) - model.dim)
-        attitude_units = np.ones(run.dim - model.dim)  # the numbers of an attitude
+        attitude_search_units = relative_noise * np.ones(n_displacement_coordinates(prepared_system) - model.dim)
+        attitude_units = np.ones(prepared_system.dim - model.dim)  # the numbers of an attitude
         return (
             data_scale.scale if sigma is None else sigma,
             np.concatenate([search_units, attitude_search_units]),
@@ -252,7 +264,7 @@ def fit(
         )
 
     shape = len(training_data), model.dim
-    can_be_refined = can_refine(params, model, trajectories, run, n_substeps)
+    can_be_refined = can_refine_by_least_squares(params, model, trajectories, prepared_system, n_substeps)
     if not matching and not shooting:
         if not can_be_refined:
             raise InputError(
@@ -268,21 +280,23 @@ def fit(
             observation,
             training_data,
             held_out_data,
-            lambda sigma: units_for(sigma)[:2],
-            smooth_time_scale(rates, data_scale),
+            lambda sigma: units_for_noise(sigma)[:2],
+            shortest_time_scale(rates, data_scale),
         )
-        least_squares = fit_by_least_squares(problem, sigma, levels, substeps)
-        refined, sigma, weights = least_squares.result, least_squares.noise, least_squares.result.weights
-        training = empty_training(params.initial_values.size, time.perf_counter() - start_time)
-        return _with_record(params, weights, training.with_estimates(params, refined, sigma, noise_is_estimated, shape))
-    units = units_for(sigma)
+        least_squares = fit_by_least_squares(problem, sigma, noise_levels, substeps)
+        least_squares_result, sigma, weights = least_squares.result, least_squares.noise, least_squares.result.weights
+        training = training_without_descent(params.initial_values.size, time.perf_counter() - start_time)
+        return _build_fitted_system(
+            params, weights, training.with_estimates(params, least_squares_result, sigma, noise_is_estimated, shape)
+        )
+    units = units_for_noise(sigma)
 
     def make_matching_objective(data: list) -> Objective:
-        return losses.trajectory_matching_objective(params, [trajectory for trajectory, _ in data], sigma, state_scale)
+        return losses.spline_matching_objective(params, [trajectory for trajectory, _ in data], sigma, state_scale)
 
     def make_shooting_objective(data: list, finds_initial_states: bool) -> Objective:
         windows = cut_windows(
-            [trajectory for trajectory, _ in data], [params for _, params in data], window, finds_initial_states
+            [trajectory for trajectory, _ in data], [states for _, states in data], window, finds_initial_states
         )
         return losses.shooting_objective(params, method, windows, observation, units, n_substeps, finds_initial_states)
 
@@ -330,15 +344,15 @@ def fit(
             params.initial_values,
             sigma,
             observation.component_indices,
-            *observation.fingerprint_parts(run, values),
+            *observation.fingerprint_parts(prepared_system, values),
             repr(settings),
         ),
     )
     path = None if checkpoint is None else Path(checkpoint)
     if path is not None and path.exists():
-        training_run.restore(path)
+        training_run.restore_checkpoint(path)
     training_run.run(seed, patience, path, progress)
-    weights, refined_or_none = training_run.weights, None
+    weights, least_squares_result_or_none = training_run.weights, None
     if shooting and can_be_refined and "interrupted" not in training_run.ended.values():
         first_states = _fitted_initial_states(
             training_run.best_vector,
@@ -347,7 +361,7 @@ def fit(
             window,
             finds_initial_states,
             observation,
-            run,
+            prepared_system,
             units[1],
         )
         pairs = [*training_data, *held_out_data]
@@ -355,19 +369,23 @@ def fit(
         runs.states[: len(first_states), 0] = first_states
         is_held_out = np.arange(len(pairs)) >= len(training_data)
         run_model = RunModel(params, method, observation)
-        refined_or_none = refine_by_least_squares(
-            run_model, weights, runs, whole_trajectories(runs), is_held_out, units[:2], n_substeps
+        least_squares_result_or_none = refine_by_least_squares(
+            run_model, weights, runs, segments_of_whole_trajectories(runs), is_held_out, units[:2], n_substeps
         )
-        weights = refined_or_none.weights
+        weights = least_squares_result_or_none.weights
     training = training_run.training_record(time.perf_counter() - start_time)
-    return _with_record(
-        params, weights, training.with_estimates(params, refined_or_none, sigma, noise_is_estimated, shape)
+    return _build_fitted_system(
+        params, weights, training.with_estimates(params, least_squares_result_or_none, sigma, noise_is_estimated, shape)
     )
 
 
-def parameters_to_fit(system: Any, parameters: Any, also: Any, positive: Any) -> tuple[System, Any, Callable]:
-    """Return the system to fit, the initial values of its named parameters or None, and a function from a system like
-    it to the vector of its parameters.
+def prepare_system_and_parameters(
+    system: Any, parameters: Any, also: Any, positive: Any
+) -> tuple[System, Any, Callable]:
+    """Return the system to fit, the initial values of its named parameters, and a function that makes the parameter
+    vector of a system.
+
+    The values are None if the parameters are not named.
 
     Raises
     ------
@@ -383,15 +401,15 @@ def parameters_to_fit(system: Any, parameters: Any, also: Any, positive: Any) ->
         return system, None, lambda system: losses.parameter_vector(system, also, positive)
     if also is not None:
         raise InputError("also= and parameters= cannot be combined. Name all parameters to fit in parameters=")
-    values = initial_parameters(system, parameters)
-    example_system = build_checked(system, values)
+    values = initial_parameter_values(system, parameters)
+    example_system = build_with_parameters(system, values)
     if has_learned_parts(example_system):
         raise InputError("parameters= are for systems without parts of lt.learn. Fit networks with also= and positive=")
     return example_system, values, lambda _: named_parameter_vector(system, values, positive)
 
 
-def _with_record(params: losses.ParameterVector, weights: np.ndarray, training: Training) -> Any:
-    """Return the fitted system with the record of the fit, and warn of its problems.
+def _build_fitted_system(params: losses.ParameterVector, weights: np.ndarray, training: Training) -> Any:
+    """Build the system with the fitted weights, attach the record of the fit, and warn of the problems of the fit.
 
     Raises
     ------
@@ -416,19 +434,22 @@ def _with_record(params: losses.ParameterVector, weights: np.ndarray, training: 
 def _fitted_initial_states(
     fitted_vector,
     params,
-    train: list,
+    training_data: list,
     window: int,
     finds_initial_states: bool,
     observation,
     prepared_system,
     search_units,
 ) -> np.ndarray:
-    """Return the initial states of whole trajectories, shape (B, N), as fitted by the shooting."""
-    starts = np.stack([states[0] for _, states in train])
+    """Return the initial states of the training trajectories, shape (B, N), as the shooting phase has fitted them."""
+    starts = np.stack([states[0] for _, states in training_data])
     if not finds_initial_states:
         return starts
     windows = cut_windows(
-        [trajectory for trajectory, _ in train], [states for _, states in train], window, finds_initial_states
+        [trajectory for trajectory, _ in training_data],
+        [states for _, states in training_data],
+        window,
+        finds_initial_states,
     )
     displacements = (
         np.asarray(fitted_vector)[params.initial_values.size :].reshape(len(windows.initial_states), -1)[
@@ -443,8 +464,9 @@ def _fitted_initial_states(
     )
 
 
-def _check_count(name: str, value: Any, minimum: int, optional: bool) -> None:
-    if optional and value is None:
+def _check_integer(name: str, value: Any, minimum: int, is_optional: bool) -> None:
+    """Raise InputError unless a value is an integer >= ``minimum``, or None if it is optional."""
+    if is_optional and value is None:
         return
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
         raise InputError(f"{name} must be an integer >= {minimum}, got {value!r}")
@@ -454,8 +476,9 @@ def _is_real_number(value: Any) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
-def checked_noise(noise: float | str | Sequence[float | str] | None, count: int) -> np.ndarray | None:
-    """Return standard deviations of the errors of data, shape (count,); None if ``noise`` is None or 0.
+def checked_noise_std(noise: float | str | Sequence[float | str] | None, n_components: int) -> np.ndarray | None:
+    """Return the standard deviations in the argument ``noise`` of a fit, shape (n_components,); None if it is None or
+    0.
 
     Texts such as ``"0.5 deg/s"`` are converted to SI units.
     """
@@ -471,15 +494,15 @@ def checked_noise(noise: float | str | Sequence[float | str] | None, count: int)
         sigma = np.array(np.nan)
     if sigma.shape == () and sigma == 0.0:
         return None
-    if sigma.shape not in ((), (count,)) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
+    if sigma.shape not in ((), (n_components,)) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
         raise InputError(
-            f"noise must be a positive standard deviation, or one for each of {count} components, got {noise!r}"
+            f"noise must be a positive standard deviation, or one for each of {n_components} components, got {noise!r}"
         )
-    return np.broadcast_to(sigma, (count,)).copy()
+    return np.broadcast_to(sigma, (n_components,)).copy()
 
 
-def _split_training_and_held_out(data: list, held_out_fraction: float, seed: int) -> tuple[list, list]:
-    """Split data into a training set and a held-out set: whole trajectories, or the end of the only one."""
+def _split_off_held_out_data(data: list, held_out_fraction: float, seed: int) -> tuple[list, list]:
+    """Split data into a training and a held-out set: by trajectories, or by time if there is only one trajectory."""
     if not (_is_real_number(held_out_fraction) and 0.0 <= held_out_fraction < 1.0):
         raise InputError(f"validation must be a fraction from 0 to below 1, got {held_out_fraction!r}")
     if held_out_fraction == 0.0:

@@ -18,8 +18,8 @@ from ..integrators import OneStepMethod
 from ..runs.integrate import integrate
 from ..systems import System
 from . import losses
-from .data import Trajectory, data_scales, estimate_noise, parse_trajectories
-from .fitting import checked_noise, fit, parameters_to_fit
+from .data import Trajectory, component_and_time_scales, estimate_noise_if_visible, parse_trajectories
+from .fitting import checked_noise_std, fit, prepare_system_and_parameters
 from .observation import make_observation
 from .training import FitWarning
 
@@ -58,7 +58,7 @@ class Determined:
 
     @with_library_settings
     def share(self, quantity: Callable[[Any], Any]) -> np.ndarray:
-        """Return how far quantities are determined, from 0 (not at all) to 1 (fully).
+        """Return how far the data determine the quantities of a system, from 0 (not at all) to 1 (fully).
 
         The result is the fraction of the norm of each gradient by the parameters that lies in the determined
         combinations.
@@ -68,9 +68,9 @@ class Determined:
         quantity : function from a system to an array
             Such as an energy at some state, or the difference of two.
         """
-        rows = _parameter_jacobian(self.parameters, quantity)
-        determined_components = rows @ self.directions[: self.rank].T
-        norms = np.linalg.norm(rows, axis=1)
+        jacobian = _jacobian_by_parameters(self.parameters, quantity)
+        determined_components = jacobian @ self.directions[: self.rank].T
+        norms = np.linalg.norm(jacobian, axis=1)
         fractions = np.linalg.norm(determined_components, axis=1) / np.where(norms > 0.0, norms, 1.0)
         return np.where(norms > 0.0, fractions, 1.0)
 
@@ -112,21 +112,23 @@ def determined(
         raise InputError(
             "the system has nothing to learn. Give it parts of lt.learn, or name parameters with also= or positive="
         )
-    jacobian = _parameter_jacobian(params, observed)
+    jacobian = _jacobian_by_parameters(params, observed)
     _, values, directions = np.linalg.svd(jacobian, full_matrices=jacobian.shape[0] < jacobian.shape[1])
     relative = np.zeros(params.initial_values.size)
     relative[: len(values)] = values / (values[0] if values[0] > 0.0 else 1.0)
     return Determined(relative, int(np.sum(relative > tolerance)), directions, params)
 
 
-def _parameter_jacobian(params: losses.ParameterVector, quantity: Callable) -> np.ndarray:
-    def values(vector):
+def _jacobian_by_parameters(params: losses.ParameterVector, quantity: Callable) -> np.ndarray:
+    """Return the Jacobian of a function of a system by the learned parameters, shape (values, p)."""
+
+    def flat_quantity(vector):
         return jnp.ravel(jnp.asarray(quantity(params.build_system(vector))))
 
-    start = jnp.asarray(params.initial_values)
-    n_values = jax.eval_shape(values, start).shape[0]
+    initial_values = jnp.asarray(params.initial_values)
+    n_values = jax.eval_shape(flat_quantity, initial_values).shape[0]
     jacobian_transform = jax.jacfwd if params.initial_values.size <= n_values else jax.jacrev
-    jacobian = np.asarray(jax.jit(jacobian_transform(values))(start))
+    jacobian = np.asarray(jax.jit(jacobian_transform(flat_quantity))(initial_values))
     if not np.isfinite(jacobian).all():
         raise InputError("the derivative of the observations by the parameters is not finite")
     return jacobian
@@ -178,7 +180,7 @@ class Fits:
 
 
 def several(
-    build: Callable[[int], T], data: Any, number: int = 5, *, seed: int = 0, resample: bool = True, **how
+    build: Callable[[int], T], data: Any, number: int = 5, *, seed: int = 0, resample: bool = True, **fit_options
 ) -> Fits:
     """Return :class:`Fits`: several systems fitted to resampled data from different initial weights.
 
@@ -210,43 +212,46 @@ def several(
     systems: list[System] = []
     previous_draws: set[tuple[int, ...]] = set()
     for fit_seed in range(seed, seed + number):
-        system, random = build(fit_seed), np.random.default_rng(fit_seed)
-        example, values, _ = parameters_to_fit(system, how.get("parameters"), how.get("also"), how.get("positive"))
-        observation = make_observation(example, how.get("observed"), how.get("observe"), values)
+        system, rng = build(fit_seed), np.random.default_rng(fit_seed)
+        example, values, _ = prepare_system_and_parameters(
+            system, fit_options.get("parameters"), fit_options.get("also"), fit_options.get("positive")
+        )
+        observation = make_observation(example, fit_options.get("observed"), fit_options.get("observe"), values)
         trajectories = parse_trajectories(data, example, observation)
         sigma = (
-            _noise_std(trajectories, how.get("noise"))
+            _given_or_estimated_noise_std(trajectories, fit_options.get("noise"))
             if resample and len(trajectories) < MIN_BOOTSTRAP_TRAJECTORIES
             else None
         )
         if sigma is not None:
             noisy_data = [
-                (t, x + (sigma * random.standard_normal((len(t), sigma.size))).reshape(x.shape))
-                for t, x in trajectories
+                (t, x + (sigma * rng.standard_normal((len(t), sigma.size))).reshape(x.shape)) for t, x in trajectories
             ]
-            noise_option = {} if how.get("noise") is None else {"noise": np.sqrt(2.0) * sigma}
-            systems.append(fit(system, noisy_data, seed=fit_seed, **{**how, **noise_option}))
+            noise_option = {} if fit_options.get("noise") is None else {"noise": np.sqrt(2.0) * sigma}
+            systems.append(fit(system, noisy_data, seed=fit_seed, **{**fit_options, **noise_option}))
             continue
-        draw = (
-            _draw_bootstrap_indices(len(trajectories), random, previous_draws) if resample else range(len(trajectories))
+        trajectory_indices = (
+            _draw_bootstrap_indices(len(trajectories), rng, previous_draws) if resample else range(len(trajectories))
         )
-        systems.append(fit(system, [trajectories[i] for i in draw], seed=fit_seed, **how))
+        systems.append(fit(system, [trajectories[i] for i in trajectory_indices], seed=fit_seed, **fit_options))
     return Fits(tuple(systems))
 
 
-def _noise_std(trajectories: list[Trajectory], noise) -> np.ndarray | None:
-    """Return the standard deviations of the measurement errors, given or estimated; None if the data show none."""
+def _given_or_estimated_noise_std(trajectories: list[Trajectory], noise) -> np.ndarray | None:
+    """Return the standard deviations of the measurement noise, given or estimated; None if no noise is visible."""
     flat_trajectories = [trajectory.flat_trajectory for trajectory in trajectories]
-    scale = data_scales(flat_trajectories).scale
-    return estimate_noise(flat_trajectories, scale) if noise is None else checked_noise(noise, scale.size)
+    scale = component_and_time_scales(flat_trajectories).scale
+    return (
+        estimate_noise_if_visible(flat_trajectories, scale) if noise is None else checked_noise_std(noise, scale.size)
+    )
 
 
 def _draw_bootstrap_indices(
-    count: int, random: np.random.Generator, previous_draws: set[tuple[int, ...]]
+    n_trajectories: int, rng: np.random.Generator, previous_draws: set[tuple[int, ...]]
 ) -> np.ndarray:
-    """Return a bootstrap sample of ``count`` indices, new if possible, and add it to ``previous_draws``."""
+    """Draw trajectory indices with replacement, if possible not as in ``previous_draws``, and add them to that set."""
     for _ in range(MAX_BOOTSTRAP_DRAWS):
-        indices = random.integers(count, size=count)
+        indices = rng.integers(n_trajectories, size=n_trajectories)
         if tuple(sorted(indices.tolist())) not in previous_draws:
             break
     previous_draws.add(tuple(sorted(indices.tolist())))

@@ -18,11 +18,11 @@ from .refining import (
     EXACT_RTOL,
     LeastSquaresResult,
     PaddedRuns,
-    Piece,
     RunModel,
+    TrajectorySegment,
     pad_runs,
     refine_by_least_squares,
-    whole_trajectories,
+    segments_of_whole_trajectories,
 )
 from .training import FitWarning
 
@@ -60,7 +60,7 @@ MAX_AUTOMATIC_SUBSTEPS = 32
 
 
 class LeastSquaresFit(NamedTuple):
-    """The result of least squares with the noise that they found.
+    """The result of a least-squares fit, with the estimate of the noise.
 
     Attributes
     ----------
@@ -84,8 +84,8 @@ class LeastSquaresProblem(NamedTuple):
     observation : Observation
     training, held_out : list of (Trajectory, array)
         Trajectories with a guess of their states, shape (m, N).
-    units_for : function from standard deviations, shape (k,), or None, to the units of observations and of the search
-    time_scale : float
+    units_for_noise : function from standard deviations, shape (k,), or None, to the units of observations and of the
+    search time_scale : float
         Time in which the fastest observation changes by its spread.
     """
 
@@ -94,14 +94,14 @@ class LeastSquaresProblem(NamedTuple):
     observation: Observation
     training: list[tuple[Trajectory, np.ndarray]]
     held_out: list[tuple[Trajectory, np.ndarray]]
-    units_for: Callable[[np.ndarray | None], tuple[np.ndarray, np.ndarray]]
+    units_for_noise: Callable[[np.ndarray | None], tuple[np.ndarray, np.ndarray]]
     time_scale: float
 
 
 def fit_by_least_squares(
-    problem: LeastSquaresProblem, noise: np.ndarray | None, levels: NoiseLevels | None, substeps: int | None
+    problem: LeastSquaresProblem, noise: np.ndarray | None, noise_levels: NoiseLevels | None, substeps: int | None
 ) -> LeastSquaresFit:
-    """Fit parameters to trajectories from their initial values, without a descent before.
+    """Fit parameters to trajectories by multiple shooting and least squares, from their initial values.
 
     Least squares over whole trajectories have many minima if the guess is off by more than half a period at their ends.
     So the first runs are short, each from its own initial state, and each stage has runs four times as long (multiple
@@ -112,7 +112,7 @@ def fit_by_least_squares(
     ----------
     noise : array, shape (k,), or None
         Standard deviations of the errors of the data, given or estimated from their differences.
-    levels : NoiseLevels, optional
+    noise_levels : NoiseLevels, optional
         The noise that the differences of the data show, unless it is given.
     substeps : int, optional
         Steps between two data.
@@ -122,33 +122,33 @@ def fit_by_least_squares(
     data = [*problem.training, *problem.held_out]
     runs = pad_runs([trajectory for trajectory, _ in data], [states for _, states in data])
     is_held_out = np.arange(len(data)) >= len(problem.training)
-    weights, units = np.asarray(problem.params.initial_values), problem.units_for(noise)
+    weights, units = np.asarray(problem.params.initial_values), problem.units_for_noise(noise)
 
     n_iterations = 0
 
-    def refine(weights, states, pieces, units, n_substeps: int, **limits) -> LeastSquaresResult:
+    def refine(weights, states, segments, units, n_substeps: int, **limits) -> LeastSquaresResult:
         nonlocal n_iterations
         result = refine_by_least_squares(
-            model, weights, runs._replace(states=states), pieces, is_held_out, units, n_substeps, **limits
+            model, weights, runs._replace(states=states), segments, is_held_out, units, n_substeps, **limits
         )
         n_iterations += result.iterations
         return result
 
-    states, whole_runs = runs.states, whole_trajectories(runs)
-    for length in _horizons([trajectory for trajectory, _ in data], problem.time_scale):
+    states, whole_runs = runs.states, segments_of_whole_trajectories(runs)
+    for length in _run_lengths_by_stage([trajectory for trajectory, _ in data], problem.time_scale):
         limits = {"tolerance": STAGE_TOLERANCE, "max_iterations": STAGE_ITERATIONS}
-        result = refine(weights, states, _pieces_of_length(runs, length), units, n_substeps, **limits)
+        result = refine(weights, states, _split_into_segments(runs, length), units, n_substeps, **limits)
         if np.isfinite(result.residual):
             weights, states = result.weights, result.states
     result = refine(weights, states, whole_runs, units, n_substeps)
     while substeps is None and np.isfinite(result.residual):
         n_substeps *= 2
-        finer = refine(result.weights, result.states, whole_runs, units, n_substeps)
-        is_enough = not np.isfinite(finer.residual) or _is_negligible(
-            finer.weights - result.weights, finer, problem.params.is_log
+        finer_result = refine(result.weights, result.states, whole_runs, units, n_substeps)
+        is_converged = not np.isfinite(finer_result.residual) or _is_negligible_change(
+            finer_result.weights - result.weights, finer_result, problem.params.is_log
         )
-        result = finer if np.isfinite(finer.residual) else result
-        if is_enough:
+        result = finer_result if np.isfinite(finer_result.residual) else result
+        if is_converged:
             break
         if n_substeps >= MAX_AUTOMATIC_SUBSTEPS:
             warn(
@@ -158,23 +158,23 @@ def fit_by_least_squares(
             )
             break
     n_observed = np.maximum(runs.is_observed.sum(axis=(0, 1)), 1)
-    data_size = np.sqrt((runs.observations**2).sum(axis=(0, 1)) / n_observed)
-    for _ in range(0 if levels is None else MAX_REWEIGHTINGS):
-        new_noise = units[0] * np.sqrt(result.mean_squares)
-        if not (new_noise > EXACT_RTOL * data_size).all():  # NaN too
+    rms_observations = np.sqrt((runs.observations**2).sum(axis=(0, 1)) / n_observed)
+    for _ in range(0 if noise_levels is None else MAX_REWEIGHTINGS):
+        new_noise = units[0] * np.sqrt(result.residual_variances)
+        if not (new_noise > EXACT_RTOL * rms_observations).all():  # NaN too
             break
         ratio = new_noise / units[0]
         if noise is not None and (np.maximum(ratio, 1.0 / ratio) < MAX_WEIGHT_RATIO).all():
             break
-        noise, units = new_noise, problem.units_for(new_noise)
+        noise, units = new_noise, problem.units_for_noise(new_noise)
         result = refine(result.weights, result.states, whole_runs, units, n_substeps)
-    if levels is not None and noise is not None:
-        result = result._replace(residual=_rms_residual_over_noise(noise, levels, n_observed))
+    if noise_levels is not None and noise is not None:
+        result = result._replace(residual=_rms_residual_over_noise(noise, noise_levels, n_observed))
     return LeastSquaresFit(result._replace(iterations=n_iterations), noise)
 
 
-def _horizons(trajectories: list[Trajectory], time_scale: float) -> list[int]:
-    """Return the numbers of intervals of the runs of all stages but the last, whose runs are whole trajectories."""
+def _run_lengths_by_stage(trajectories: list[Trajectory], time_scale: float) -> list[int]:
+    """Return the length of the runs, in data intervals, in each stage before the last, which has whole trajectories."""
     max_intervals = max(len(t) - 1 for t, _ in trajectories)
     interval = float(np.median(np.concatenate([np.diff(t) for t, _ in trajectories])))
     length = max(MIN_HORIZON_INTERVALS, round(FIRST_HORIZON * time_scale / interval))
@@ -185,34 +185,35 @@ def _horizons(trajectories: list[Trajectory], time_scale: float) -> list[int]:
     return lengths
 
 
-def _pieces_of_length(runs: PaddedRuns, length: int) -> list[Piece]:
-    """Return pieces of ``length`` times of all trajectories; a rest shorter than half of it belongs to the last one."""
-    pieces = []
+def _split_into_segments(runs: PaddedRuns, n_times_per_segment: int) -> list[TrajectorySegment]:
+    """Cut all trajectories into segments of ``n_times_per_segment`` times; less than half a segment extends the one
+    before."""
+    segments = []
     for i, is_observed in enumerate(runs.is_observed):
         n_times = 1 + int(np.flatnonzero(is_observed.any(axis=1))[-1])
-        starts = list(range(0, n_times, length))
-        if len(starts) > 1 and n_times - starts[-1] < length / 2:
+        starts = list(range(0, n_times, n_times_per_segment))
+        if len(starts) > 1 and n_times - starts[-1] < n_times_per_segment / 2:
             starts.pop()
-        pieces += [Piece(i, start, stop) for start, stop in itertools.pairwise([*starts, n_times])]
-    return pieces
+        segments += [TrajectorySegment(i, start, stop) for start, stop in itertools.pairwise([*starts, n_times])]
+    return segments
 
 
-def _rms_residual_over_noise(residuals: np.ndarray, levels: NoiseLevels, counts: np.ndarray) -> float:
-    """Return the root mean square of residuals over the noise estimated from the data; 1 if there is no estimate.
+def _rms_residual_over_noise(residuals: np.ndarray, noise_levels: NoiseLevels, n_observed: np.ndarray) -> float:
+    """Return the root mean square of residuals divided by the estimated noise; 1 if there is no estimate.
 
     Where the differences show no noise but bound it, residuals below the bound count as noise.
     """
-    ratio = residuals / levels.std
-    ratio = np.where(levels.is_noise, ratio, np.maximum(ratio, 1.0))
-    if not levels.is_bound.any():
+    ratio = residuals / noise_levels.std
+    ratio = np.where(noise_levels.is_noise, ratio, np.maximum(ratio, 1.0))
+    if not noise_levels.is_bound.any():
         return 1.0
-    return float(np.sqrt(np.average(ratio**2, weights=counts * levels.is_bound)))
+    return float(np.sqrt(np.average(ratio**2, weights=n_observed * noise_levels.is_bound)))
 
 
-def _is_negligible(shift: np.ndarray, result: LeastSquaresResult, is_log: np.ndarray) -> bool:
-    """Return True if a change of the parameters is small by their standard errors, or by their size."""
+def _is_negligible_change(parameter_change: np.ndarray, result: LeastSquaresResult, is_log: np.ndarray) -> bool:
+    """Return True if a change of the parameters is small compared with their standard errors or their values."""
     with np.errstate(invalid="ignore"):
         errors = np.sqrt(np.diag(result.covariance))
-    is_small_by_error = ~(np.abs(shift) > MAX_STEP_BIAS * errors)  # an infinite error allows any change
-    size = np.where(is_log, 1.0, np.abs(result.weights))
-    return bool((is_small_by_error | (np.abs(shift) <= MIN_RELATIVE_BIAS * size)).all())
+    is_small_by_error = ~(np.abs(parameter_change) > MAX_STEP_BIAS * errors)  # an infinite error allows any change
+    parameter_scale = np.where(is_log, 1.0, np.abs(result.weights))
+    return bool((is_small_by_error | (np.abs(parameter_change) <= MIN_RELATIVE_BIAS * parameter_scale)).all())

@@ -72,18 +72,18 @@ def parameter_vector(system: System, also: Callable | None = None, positive: Cal
         return copy_entropy_to_poisson(eqx.combine(jax.tree_util.tree_map(jnp.exp, logs), values, fixed_part))
 
     shapes = tuple(np.shape(leaf) for leaf in jax.tree_util.tree_leaves(logs_and_values))
-    count = sum(np.size(leaf) for leaf in jax.tree_util.tree_leaves(logs))
+    n_logs = sum(np.size(leaf) for leaf in jax.tree_util.tree_leaves(logs))
     return ParameterVector(
         np.asarray(initial_values),
         shapes,
         build_system,
-        _leaf_entry_names(logs_and_values),
-        np.arange(initial_values.size) < count,
+        _entry_names_of_pytrees(logs_and_values),
+        np.arange(initial_values.size) < n_logs,
     )
 
 
-def _leaf_entry_names(trees: tuple) -> tuple[str, ...]:
-    """Return the name of each number in some trees, such as ``energy.A[0]``, in order."""
+def _entry_names_of_pytrees(trees: tuple) -> tuple[str, ...]:
+    """Return the name of each array entry in some pytrees, such as ``energy.A[0]``, in order."""
     leaves = [leaf for tree in trees for leaf in jax.tree_util.tree_leaves_with_path(tree)]
     return tuple(name for path, leaf in leaves for name in entry_names({jax.tree_util.keystr(path).lstrip("."): leaf}))
 
@@ -107,35 +107,37 @@ class Objective(NamedTuple):
     initial_free: np.ndarray
 
 
-def matching_objective(params: ParameterVector, x: np.ndarray, rates: np.ndarray, rate_scale: np.ndarray) -> Objective:
-    """Return the objective whose loss is the mean square difference of the vector field and given rates.
+def rate_matching_objective(
+    params: ParameterVector, states: np.ndarray, rates: np.ndarray, rate_scale: np.ndarray
+) -> Objective:
+    """Return an objective whose loss is the mean square difference between the vector field at states and given rates.
 
     The residual is relative to the speed of the state. Otherwise the few fastest moments would dominate the loss, and
     the phase of a slow motion, in which errors accumulate, would not count.
     """
 
     def loss(vector, arrays, indices):
-        points, rates = (values[indices] for values in arrays)
-        field = jax.vmap(params.build_system(vector)._vector_field)(points)
+        batch_states, rates = (values[indices] for values in arrays)
+        field = jax.vmap(params.build_system(vector)._vector_field)(batch_states)
         speed = jnp.mean((rates / rate_scale) ** 2, axis=1, keepdims=True)
         return jnp.mean(((field - rates) / rate_scale) ** 2 / (MEAN_SQUARE_RATE_FLOOR + speed))
 
-    return Objective(loss, (jnp.asarray(x), jnp.asarray(rates)), len(x), np.zeros(0))
+    return Objective(loss, (jnp.asarray(states), jnp.asarray(rates)), len(states), np.zeros(0))
 
 
-def trajectory_matching_objective(
-    params: ParameterVector, data: list[Trajectory], noise: np.ndarray | None, scales: DataScales
+def spline_matching_objective(
+    params: ParameterVector, trajectories: list[Trajectory], noise: np.ndarray | None, scales: DataScales
 ) -> Objective:
-    """Return the objective of matching at the points of trajectories; splines give their states and rates."""
-    smoothed_trajectories = [spline_states_and_rates(trajectory, noise) for trajectory in data]
-    inner = [
+    """Return the rate-matching objective for trajectories, whose states and rates come from splines."""
+    smoothed_trajectories = [spline_states_and_rates(trajectory, noise) for trajectory in trajectories]
+    used_rows = [
         slice(1, -1) if len(x) > 8 else slice(None) for x, _ in smoothed_trajectories
     ]  # a spline is worst at its ends
     x, rates = (
-        np.concatenate([values[i] for values, i in zip(arrays, inner, strict=True)])
+        np.concatenate([values[i] for values, i in zip(arrays, used_rows, strict=True)])
         for arrays in zip(*smoothed_trajectories, strict=True)
     )
-    return matching_objective(params, x, rates, scales.scale / scales.time_scale)
+    return rate_matching_objective(params, x, rates, scales.scale / scales.time_scale)
 
 
 def shooting_objective(
@@ -147,7 +149,7 @@ def shooting_objective(
     substeps: int,
     finds_initial_states: bool,
 ) -> Objective:
-    """Return the objective whose loss is the mean square difference of short runs and the data.
+    """Return an objective whose loss is the mean square difference between short runs and the observations.
 
     With ``finds_initial_states`` the initial states of the runs are fitted too. Then the loss includes their
     differences to the data, and the gaps between the end of a run and the start of the next one.
@@ -164,18 +166,21 @@ def shooting_objective(
     def loss(vector, arrays, indices):
         initial_guess, intervals, observations, times, next_window = arrays
         system, values = params.build_system(vector[:p]), params.parameters_of(vector[:p])
-        run, begin, advance, state_of = differentiable_stepper(system, method, substeps, observation.group is not None)
+        prepared_system, init, advance, get_state = differentiable_stepper(
+            system, method, substeps, observation.group is not None
+        )
 
         def run_window(x, h):
             def advance_over_interval(carry, h):
                 carry = advance(carry, h)
-                return carry, state_of(carry)
+                return carry, get_state(carry)
 
-            return jax.lax.scan(advance_over_interval, begin(x), h)[1]
+            return jax.lax.scan(advance_over_interval, init(x), h)[1]
 
-        def squares(states, i, j):
-            """Return the mean square of the residuals of states at times j of the windows i, without missing values."""
-            predictions = jax.vmap(lambda x, t: observation.observe(run, x, t, values))
+        def mean_square_residual(states, i, j):
+            """Return the mean square residual of states, observed at times j of the windows i; missing values do not
+            count."""
+            predictions = jax.vmap(lambda x, t: observation.observe(prepared_system, x, t, values))
             predictions = predictions if states.ndim == 2 else jax.vmap(predictions)
             values_of_windows = observations[i, j]
             residuals = (predictions(states, times[i, j]) - jnp.nan_to_num(values_of_windows)) / data_unit
@@ -188,15 +193,17 @@ def shooting_objective(
             return (
                 initial_guess[i]
                 if displacements is None
-                else jax.vmap(lambda x, z: observation.displace(run, x, z))(initial_guess[i], displacements[i])
+                else jax.vmap(lambda x, z: observation.displace(prepared_system, x, z))(
+                    initial_guess[i], displacements[i]
+                )
             )
 
         start_states = initial_states(indices)
         path = jax.vmap(run_window)(start_states, intervals[indices])
-        path_loss = squares(path, indices, slice(1, None))
+        path_loss = mean_square_residual(path, indices, slice(1, None))
         if displacements is None:
             return path_loss
-        initial_loss = squares(start_states, indices, 0) / length
+        initial_loss = mean_square_residual(start_states, indices, 0) / length
         next_indices = next_window[indices]
         gaps = jnp.where(next_indices[:, None] >= 0, (path[:, -1] - initial_states(next_indices)) / gap_unit, 0.0)
         return path_loss + initial_loss + jnp.mean(gaps**2)
@@ -208,7 +215,7 @@ def shooting_objective(
 
 
 class DifferentiableStepper(NamedTuple):
-    """A prepared system, and the functions of a differentiable run of it.
+    """A prepared system with functions that start, advance and read a differentiable run.
 
     Attributes
     ----------
@@ -227,7 +234,7 @@ class DifferentiableStepper(NamedTuple):
 def differentiable_stepper(
     system: System, method: OneStepMethod, substeps: int | jax.Array, has_attitude: bool = False
 ) -> DifferentiableStepper:
-    """Return a prepared system, and the functions that start, advance and read a differentiable run of it.
+    """Prepare a system for differentiable runs; return it with functions that start, advance and read a run.
 
     A traced number of substeps permits derivatives in forward mode only.
 

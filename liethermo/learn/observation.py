@@ -23,7 +23,7 @@ from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 
 
 def fast_compile_options() -> dict[str, Any]:
-    """Return options with which long programs of derivatives compile sooner and run about as fast.
+    """Return XLA options that compile long derivative programs faster; they run about as fast.
 
     A level of optimisation that the user has set is respected.
     """
@@ -77,16 +77,16 @@ class Observation(NamedTuple):
     needs_parameters: bool = False
 
     def observe(self, prepared_system: System, state, t, parameters) -> jax.Array:
-        """Return the observation of a state of a run at a time, as a flat array."""
+        """Return the observed quantities in a state of a run at time t, as a flat array of shape (k,)."""
         x, attitude = (
             prepared_system.split_state(state) if isinstance(prepared_system, AttitudeSystem) else (state, None)
         )
         return jnp.ravel(self.function(x, attitude, t, parameters))
 
     def fingerprint_parts(self, prepared_system: System, parameters) -> list:
-        """Return the jaxpr and the constants of the observation, which identify it."""
+        """Return the jaxpr and the constants of the observation function, to be hashed as its identity."""
         jaxpr = jax.make_jaxpr(lambda state, t: self.observe(prepared_system, state, t, parameters))(
-            jnp.asarray(default_states(self, prepared_system, self.zero_observations)[0]), jnp.zeros(())
+            jnp.asarray(states_from_observations(self, prepared_system, self.zero_observations)[0]), jnp.zeros(())
         )
         return [str(jaxpr.jaxpr), *map(np.asarray, jaxpr.consts)]
 
@@ -95,7 +95,7 @@ class Observation(NamedTuple):
         return np.zeros((1, int(np.prod(self.shape))))
 
     def observe_solution(self, solution: Solution) -> jax.Array:
-        """Return the observations along a solution, shape (m, ...).
+        """Return the observed quantities at each time of a solution, shape (m, ...).
 
         Raises
         ------
@@ -115,8 +115,8 @@ class Observation(NamedTuple):
         return jax.vmap(lambda x, R, t: self.function(x, R, t, None))(x, jnp.asarray(solution.attitude), t)
 
     def displace(self, prepared_system: System, state, z) -> jax.Array:
-        """Return the state displaced by coordinates z: ``x + z``, and ``g exp(hat(z))`` with the remaining
-        coordinates."""
+        """Return a state displaced by tangent coordinates z: x + z, and the attitude times the exponential of the
+        remaining ones."""
         if not isinstance(prepared_system, AttitudeSystem):
             return state + z
         (x, g), n, group = (
@@ -133,7 +133,7 @@ def make_observation(
     observe: Callable | None,
     parameters: Mapping[str, Any] | None = None,
 ) -> Observation:
-    """Return the observation that the arguments ``observed`` and ``observe`` of a fit describe.
+    """Make an :class:`Observation` from the arguments ``observed`` and ``observe`` of a fit.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def make_observation(
     InputError, FunctionError
     """
     if observe is None:
-        indices = _component_indices(observed, system.dim)
+        indices = _checked_component_indices(observed, system.dim)
         return Observation(lambda x, *arguments: x[indices], (len(indices),), indices, None, observed is None)
     if observed is not None:
         raise InputError("observed= and observe= cannot be combined. Give component numbers or a function of the state")
@@ -159,19 +159,19 @@ def make_observation(
 
     def function(x, attitude, t, parameters):
         values = {"x": x, "attitude": attitude, "t": t, "parameters": parameters}
-        return _to_array(observe(*(values[kind] for kind in kinds)))
+        return _observation_as_array(observe(*(values[kind] for kind in kinds)))
 
     zero_state = jnp.zeros(system.dim), None if group is None else group.identity, jnp.zeros(())
     names: list[str] = []
     try:
 
-        def evaluate(*arrays):
-            parts = dict(zip(("x", "attitude", "t", "parameters"), arrays, strict=True))
-            result = observe(*(parts[kind] for kind in kinds))
-            names[:] = list(entry_names(result)) if isinstance(result, Mapping) else []
-            return _to_array(result)
+        def evaluate_and_record_names(*arrays):
+            argument_by_kind = dict(zip(("x", "attitude", "t", "parameters"), arrays, strict=True))
+            observed_values = observe(*(argument_by_kind[kind] for kind in kinds))
+            names[:] = list(entry_names(observed_values)) if isinstance(observed_values, Mapping) else []
+            return _observation_as_array(observed_values)
 
-        output_shape = checked_result_shapes(evaluate, *zero_state, parameters)
+        output_shape = checked_result_shapes(evaluate_and_record_names, *zero_state, parameters)
     except IndexOutOfRangeError as error:
         raise error.with_function(f"observe, at a state of shape ({system.dim},),") from None
     except KeyError as error:
@@ -196,44 +196,44 @@ ATTITUDE_NAMES = ("R", "attitude")
 
 
 def _argument_kinds(observe: Any, has_parameters: bool) -> tuple[str, ...]:
-    """Return what each argument of ``observe`` is: ``"x"``, ``"attitude"``, ``"t"`` or ``"parameters"``.
+    """Return the meaning of each argument of ``observe``: ``"x"``, ``"attitude"``, ``"t"`` or ``"parameters"``.
 
     Raises
     ------
     InputError
     """
-    count = required_argument_count(observe) if callable(observe) else 0
+    n_arguments = required_argument_count(observe) if callable(observe) else 0
     if not has_parameters:
-        if count not in (1, 2):
+        if n_arguments not in (1, 2):
             raise InputError(
                 "observe must be a function of the state, or of the state and the attitude, such as lambda x, R: R; "
                 "with parameters= also of (x, parameters) or (t, x, parameters)"
             )
-        return ("x", "attitude")[:count]
+        return ("x", "attitude")[:n_arguments]
     kinds: dict[int, tuple[str, ...]] = {1: ("x",), 2: ("x", "parameters"), 3: ("t", "x", "parameters")}
-    names = list(inspect.signature(observe).parameters)[:count] if count else []
-    positions = [i for i, name in enumerate(names) if name in ATTITUDE_NAMES]
-    remaining = (count or 0) - len(positions)
-    if remaining not in kinds or len(positions) > 1:
+    names = list(inspect.signature(observe).parameters)[:n_arguments] if n_arguments else []
+    attitude_positions = [i for i, name in enumerate(names) if name in ATTITUDE_NAMES]
+    n_other_arguments = (n_arguments or 0) - len(attitude_positions)
+    if n_other_arguments not in kinds or len(attitude_positions) > 1:
         raise InputError(
             "observe must be a function of (x), (x, parameters) or (t, x, parameters), and of the attitude if one of "
             f"these is called R; got {observe!r}"
         )
-    result = list(kinds[remaining])
-    for i in positions:
+    result = list(kinds[n_other_arguments])
+    for i in attitude_positions:
         result.insert(i, "attitude")
     return tuple(result)
 
 
-def _to_array(result: Any) -> jax.Array:
-    """Return an observation as an array; a dict of observed numbers by name as the numbers in a row."""
-    if isinstance(result, Mapping):
-        return jnp.concatenate([jnp.ravel(jnp.asarray(value, dtype=jnp.float64)) for value in result.values()])
-    return jnp.asarray(result)
+def _observation_as_array(observation: Any) -> jax.Array:
+    """Return an observation as an array; the arrays in a dict are concatenated."""
+    if isinstance(observation, Mapping):
+        return jnp.concatenate([jnp.ravel(jnp.asarray(value, dtype=jnp.float64)) for value in observation.values()])
+    return jnp.asarray(observation)
 
 
 def entry_names(arrays: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the name of each number in a dict of arrays: ``omega[0]`` for the entries of an array, in order."""
+    """Return a name for each entry of the arrays in a dict, such as ``omega[0]``, in order."""
     return tuple(
         str(name) + (f"[{', '.join(map(str, index))}]" if np.ndim(value) else "")
         for name, value in arrays.items()
@@ -241,7 +241,9 @@ def entry_names(arrays: Mapping[str, Any]) -> tuple[str, ...]:
     )
 
 
-def _component_indices(observed: Sequence[int] | None, dim: int) -> np.ndarray:
+def _checked_component_indices(observed: Sequence[int] | None, dim: int) -> np.ndarray:
+    """Return the indices of the observed components, all if ``observed`` is None; raise InputError if one is invalid
+    or occurs twice."""
     if observed is None:
         return np.arange(dim)
     try:
@@ -261,8 +263,8 @@ def _component_indices(observed: Sequence[int] | None, dim: int) -> np.ndarray:
     return indices
 
 
-def default_states(observation: Observation, prepared_system: System, observations: np.ndarray) -> np.ndarray:
-    """Return states of a run, shape (m, N): observed components, zeros elsewhere, and the identity as attitude."""
+def states_from_observations(observation: Observation, prepared_system: System, observations: np.ndarray) -> np.ndarray:
+    """Fill states, shape (m, N), with the observed components, zeros for the others, and the identity as attitude."""
     x = np.zeros((len(observations), dim_without_attitude(prepared_system)))
     if len(observation.component_indices):
         x[:, observation.component_indices] = observations
@@ -271,39 +273,43 @@ def default_states(observation: Observation, prepared_system: System, observatio
     )
 
 
-def states_matching_rates(
+def states_matching_observations_and_rates(
     observation: Observation,
     prepared_system: System,
-    data: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
-    unit: np.ndarray,
+    trajectories_with_rates: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    observation_scale: np.ndarray,
     time_scale: float,
     parameters: Mapping[str, Any] | None,
 ) -> list[np.ndarray]:
-    """Return the states of each trajectory, shape (m, N), whose observations and rates match the data.
+    """Find states, shape (m, N) for each trajectory, whose observations and their rates of change match the data.
 
     The search for each state starts from the one before it. The first search starts from several attitudes, because the
     identity may be far away.
 
     Parameters
     ----------
-    data : list of three arrays each, shapes (m,), (m, k) and (m, k)
+    trajectories_with_rates : list of three arrays each, shapes (m,), (m, k) and (m, k)
         Times, observations and their rates of change.
-    unit : array, shape (k,)
+    observation_scale : array, shape (k,)
         Scales of the observations.
     time_scale : float
         Time in which the observations change by their scales.
     parameters : dict of arrays or None
         Parameters on which the observations depend.
     """
-    zero, scale = jnp.zeros(n_displacement_coordinates(prepared_system)), np.tile(unit, 2)
+    zero, scale = jnp.zeros(n_displacement_coordinates(prepared_system)), np.tile(observation_scale, 2)
 
-    def residual(z, base_state, t, y, observed_rate):
-        def observe(state, t):
-            return observation.observe(prepared_system, state, t, parameters)
+    def residual(displacement, base_state, time, observed_values, observed_rate):
+        def observe(state, time):
+            return observation.observe(prepared_system, state, time, parameters)
 
-        x = observation.displace(prepared_system, base_state, z)
-        observed_values, rate = jax.jvp(observe, (x, t), (prepared_system._vector_field(x), jnp.ones_like(t)))
-        return jnp.concatenate([observed_values - y, time_scale * (rate - observed_rate)]) / scale
+        x = observation.displace(prepared_system, base_state, displacement)
+        predicted_values, predicted_rate = jax.jvp(
+            observe, (x, time), (prepared_system._vector_field(x), jnp.ones_like(time))
+        )
+        return (
+            jnp.concatenate([predicted_values - observed_values, time_scale * (predicted_rate - observed_rate)]) / scale
+        )
 
     def solve_state(state, *data_at_time):
         def step(carry, _):
@@ -323,18 +329,18 @@ def states_matching_rates(
 
         return jax.lax.scan(step, (state, INITIAL_DAMPING), length=LEVENBERG_ITERATIONS)[0][0]
 
-    def solve_states_in_turn(start, data_of_trajectory):
+    def solve_states_in_turn(initial_guess, data_of_trajectory):
         def step(state, data_at_time):
             state = solve_state(state, *data_at_time)
             return state, state
 
-        return jax.lax.scan(step, start, data_of_trajectory)[1]
+        return jax.lax.scan(step, initial_guess, data_of_trajectory)[1]
 
     @functools.partial(jax.jit, compiler_options=fast_compile_options())
     def solve_trajectory(initial_guesses, *data_of_trajectory):
-        first = [values[0] for values in data_of_trajectory]
-        first_states = jax.vmap(lambda state: solve_state(state, *first))(initial_guesses)
-        costs = jax.vmap(lambda state: jnp.sum(residual(zero, state, *first) ** 2))(first_states)
+        first_data = [values[0] for values in data_of_trajectory]
+        first_states = jax.vmap(lambda state: solve_state(state, *first_data))(initial_guesses)
+        costs = jax.vmap(lambda state: jnp.sum(residual(zero, state, *first_data) ** 2))(first_states)
         return solve_states_in_turn(first_states[jnp.argmin(costs)], data_of_trajectory)
 
     random_displacements = np.random.default_rng(0).standard_normal((N_INITIAL_ATTITUDES, len(zero))) * (
@@ -343,22 +349,22 @@ def states_matching_rates(
     random_displacements[0] = 0.0
     random_displacements = random_displacements[: 1 if observation.group is None else N_INITIAL_ATTITUDES]
     states = []
-    for t, observations, rates in data:
-        start = jnp.asarray(default_states(observation, prepared_system, observations[:1])[0])
-        starts = jax.vmap(lambda z, start=start: observation.displace(prepared_system, start, z))(
-            jnp.asarray(random_displacements)
-        )
-        states.append(np.asarray(solve_trajectory(starts, *map(jnp.asarray, (t, observations, rates)))))
+    for t, observations, rates in trajectories_with_rates:
+        base_state = jnp.asarray(states_from_observations(observation, prepared_system, observations[:1])[0])
+        initial_guesses = jax.vmap(
+            lambda z, base_state=base_state: observation.displace(prepared_system, base_state, z)
+        )(jnp.asarray(random_displacements))
+        states.append(np.asarray(solve_trajectory(initial_guesses, *map(jnp.asarray, (t, observations, rates)))))
     return states
 
 
 def dim_without_attitude(prepared_system: System) -> int:
-    """Return the number of state components without the attitude."""
+    """Return the number of state components that do not belong to the attitude."""
     return prepared_system.body.dim if isinstance(prepared_system, AttitudeSystem) else prepared_system.dim
 
 
 def n_displacement_coordinates(prepared_system: System) -> int:
-    """Return the number of coordinates of :meth:`Observation.displace`."""
+    """Return the number of tangent coordinates by which :meth:`Observation.displace` moves a state."""
     return dim_without_attitude(prepared_system) + (
         prepared_system.group.dim if isinstance(prepared_system, AttitudeSystem) else 0
     )

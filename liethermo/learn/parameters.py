@@ -19,8 +19,8 @@ from .losses import ParameterVector
 from .observation import entry_names
 
 
-def initial_parameters(system: System | Callable, parameters: Any) -> dict[str, np.ndarray]:
-    """Return the initial values of the parameters of a fit by name.
+def initial_parameter_values(system: System | Callable, parameters: Any) -> dict[str, np.ndarray]:
+    """Return the initial values of the named parameters of a fit, as a dict of arrays.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def initial_parameters(system: System | Callable, parameters: Any) -> dict[str, 
         If names or values cannot be used.
     """
     if isinstance(system, System) and not isinstance(parameters, Mapping):
-        names = _list_of_names(parameters)
+        names = _as_name_list(parameters)
         if names is None:
             raise InputError(f"parameters must be names, or a dict from names to initial values, got {parameters!r}")
         parameters = {name: find_parameter(system, name).value for name in names}
@@ -55,8 +55,8 @@ def initial_parameters(system: System | Callable, parameters: Any) -> dict[str, 
     return values
 
 
-def build_checked(system: System | Callable, values: Mapping[str, Any]) -> System:
-    """Return the system with values of its parameters.
+def build_with_parameters(system: System | Callable, parameter_values: Mapping[str, Any]) -> System:
+    """Build the system with the given parameter values, after checking that traced values build one too.
 
     Raises
     ------
@@ -64,13 +64,16 @@ def build_checked(system: System | Callable, values: Mapping[str, Any]) -> Syste
         If there is no such system, or the function does not return one or does not accept traced values.
     """
     try:
-        built_system = system_with_parameters(system, values)
+        built_system = system_with_parameters(system, parameter_values)
     except KeyError as error:
         raise InputError(f"the system needs the parameter {error}. Add it to parameters=") from None
     if not isinstance(built_system, System):
         raise InputError(f"the function that builds the system must return a system, got {type(built_system).__name__}")
     try:
-        jax.eval_shape(lambda values: ravel_pytree(system_with_parameters(system, values))[0], dict(values))
+        jax.eval_shape(
+            lambda parameter_values: ravel_pytree(system_with_parameters(system, parameter_values))[0],
+            dict(parameter_values),
+        )
     except TRACE_ERRORS as error:
         description = "the function that builds the system could not be evaluated for traced parameters"
         raise FunctionError(trace_error_message(description, error)) from error
@@ -80,7 +83,7 @@ def build_checked(system: System | Callable, values: Mapping[str, Any]) -> Syste
 def named_parameter_vector(
     system: System | Callable, values: Mapping[str, np.ndarray], positive: Any = None
 ) -> ParameterVector:
-    """Return parameters by name as one vector, with logarithms of those that stay positive.
+    """Pack named parameters into a :class:`ParameterVector`, with the logarithms of those that stay positive.
 
     Parameters
     ----------
@@ -92,7 +95,7 @@ def named_parameter_vector(
     InputError
         If a name is not known, or a parameter that stays positive has an initial value that is not.
     """
-    log_names = _positive_names(positive, list(values))
+    log_names = _names_of_positive_parameters(positive, list(values))
     for name in log_names:
         if not (values[name] > 0.0).all():
             raise InputError(f"the parameter {name!r} must stay positive, but its initial value is {values[name]}")
@@ -115,10 +118,11 @@ def named_parameter_vector(
     )
 
 
-def _positive_names(positive: Any, names: list[str]) -> tuple[str, ...]:
+def _names_of_positive_parameters(positive: Any, names: list[str]) -> tuple[str, ...]:
+    """Return the names of the parameters that stay positive; raise InputError if one is unknown."""
     if positive is None or isinstance(positive, bool):
         return tuple(names) if positive else ()
-    name_list = _list_of_names(positive)
+    name_list = _as_name_list(positive)
     if name_list is None:
         raise InputError(f"positive must be True, or names of parameters, if parameters= is given; got {positive!r}")
     if unknown := [name for name in name_list if name not in names]:
@@ -126,7 +130,7 @@ def _positive_names(positive: Any, names: list[str]) -> tuple[str, ...]:
     return tuple(name_list)
 
 
-def _list_of_names(names: Any) -> list[str] | None:
-    """Return a name or names as a list; None if they are something else."""
+def _as_name_list(names: Any) -> list[str] | None:
+    """Return one name, or several, as a list; None if a value is not a text."""
     name_list = [names] if isinstance(names, str) else list(names) if isinstance(names, Iterable) else [names]
     return name_list if all(isinstance(name, str) for name in name_list) else None

@@ -28,7 +28,7 @@ from .data import DataScales
 
 
 class Learned(Module):
-    """Mark of a learned function: floating-point arrays inside it are parameters of :func:`liethermo.learn.fit`.
+    """A function whose floating-point arrays are parameters that :func:`liethermo.learn.fit` learns.
 
     Calling it calls the function. Arrays outside of such marks are not changed by a fit.
 
@@ -46,7 +46,7 @@ class Learned(Module):
 
 @eqx.filter_jit
 def _call_jitted(function: Callable, arguments: tuple):
-    """Call a function under ``jit``, so that compiled programs contain one routine for all calls."""
+    """Call a function under ``jit``, so that a compiled program has one routine for all calls of it."""
     return function(*arguments)
 
 
@@ -114,20 +114,20 @@ class Network(Module):
 
 
 def learned_mask(tree: Any) -> Any:
-    """Return a pytree that is True for learned leaves; a part without any is a single False.
+    """Return a pytree with True for each learned array; a subtree without any is a single False.
 
     Constants in plain functions inside a mark are not learned.
     """
 
-    def is_parameter(part):
-        return False if isinstance(part, TracedFunction) else eqx.is_inexact_array(part)
+    def is_parameter(node):
+        return False if isinstance(node, TracedFunction) else eqx.is_inexact_array(node)
 
-    def mask_part(part):
-        if not isinstance(part, Learned):
+    def mask_part(node):
+        if not isinstance(node, Learned):
             return False
-        return jax.tree_util.tree_map(is_parameter, part, is_leaf=lambda leaf: isinstance(leaf, TracedFunction))
+        return jax.tree_util.tree_map(is_parameter, node, is_leaf=lambda leaf: isinstance(leaf, TracedFunction))
 
-    return jax.tree_util.tree_map(mask_part, tree, is_leaf=lambda part: isinstance(part, Learned))
+    return jax.tree_util.tree_map(mask_part, tree, is_leaf=lambda node: isinstance(node, Learned))
 
 
 class Energy(Function):
@@ -195,7 +195,7 @@ class _ScalarOutput(eqx.Module):
         return self.network(x)[0]
 
 
-def _function_or_network(
+def _learned_function_or_network(
     function: Callable | None, dim: int, outputs: int, width: int, depth: int, seed: int
 ) -> Callable:
     return Network.from_sizes(dim, outputs, width, depth, seed) if function is None else Learned(function)
@@ -230,7 +230,7 @@ class Poisson(mf.PoissonStructure):
     n_components: int = eqx.field(static=True)
 
     def __init__(self, dim: int, width: int = 32, depth: int = 2, seed: int = 2, function: Callable | None = None):
-        self.function = _function_or_network(function, dim, dim * (dim - 1) // 2, width, depth, seed)
+        self.function = _learned_function_or_network(function, dim, dim * (dim - 1) // 2, width, depth, seed)
         self.n_components, self.metric, self.entropy = dim, jnp.ones(dim), None
 
     @staticmethod
@@ -323,7 +323,7 @@ class Friction(Dissipation):
         if isinstance(rank, bool) or not isinstance(rank, int) or rank < 1:
             raise InputError(f"rank must be a positive integer, got {rank!r}")
         numbers = rank * (dim * (dim - 1) // 2 if construction == "skew" else dim)
-        self.function = _function_or_network(function, dim, numbers, width, depth, seed)
+        self.function = _learned_function_or_network(function, dim, numbers, width, depth, seed)
         self.n_components, self.rank, self.construction, self.metric = dim, rank, construction, jnp.ones(dim)
 
     def bind_to(self, system):
@@ -410,23 +410,23 @@ class Metriplectic(MetriplecticSystem):
             friction = Friction(dim, rank, width=width, depth=depth, seed=4 * seed + 3)
         has_learned_tensor = isinstance(poisson, Poisson)  # but for the Jacobi identity
         super().__init__(poisson, energy, entropy, friction, dim=dim, validate=validate and not has_learned_tensor)
-        self.poisson = fill_poisson_entropy(self.poisson, self.entropy)
+        self.poisson = set_poisson_entropy(self.poisson, self.entropy)
 
 
-def fill_poisson_entropy(poisson: mf.PoissonStructure, entropy: AnyEnergy | None) -> mf.PoissonStructure:
-    """Return the structure with the system's entropy filled in, if it is a learned one that needs it."""
+def set_poisson_entropy(poisson: mf.PoissonStructure, entropy: AnyEnergy | None) -> mf.PoissonStructure:
+    """Return a Poisson structure with the entropy of its system stored in it, if it is a learned one that needs it."""
     if not isinstance(poisson, Poisson) or poisson.entropy is None:
         return poisson
     return eqx.tree_at(lambda p: p.entropy, poisson, entropy)
 
 
 def copy_entropy_to_poisson(system: T) -> T:
-    """Return the system with the current weights of its entropy also in its Poisson structure."""
-    return eqx.tree_at(lambda s: s.poisson, system, fill_poisson_entropy(system.poisson, system.entropy))
+    """Return the system with the current weights of its entropy copied to its Poisson structure."""
+    return eqx.tree_at(lambda s: s.poisson, system, set_poisson_entropy(system.poisson, system.entropy))
 
 
 def scale_networks(system: T, scales: DataScales, points: np.ndarray) -> T:
-    """Return the system with its networks scaled to the data, so that their inputs and outputs are of order one.
+    """Return the system with the scales of its networks set from the data, so that inputs and outputs are of order one.
 
     Networks that have scales already are not changed.
 
@@ -440,7 +440,7 @@ def scale_networks(system: T, scales: DataScales, points: np.ndarray) -> T:
     x, s, tau = jnp.asarray(points), jnp.asarray(scales.scale), scales.time_scale
 
     def mean_variation(function: AnyEnergy) -> float:
-        """Return the mean variation of a known function over the data."""
+        """Return the mean over the data of the change of a function over one standard deviation of the state."""
         return float(jnp.mean(jnp.abs(jax.vmap(function.gradient)(x) * s)))
 
     energy = entropy = 1.0
@@ -457,13 +457,13 @@ def scale_networks(system: T, scales: DataScales, points: np.ndarray) -> T:
     energy = energy if energy > 0.0 else 1.0
     pairs = jnp.outer(s, s)[np.triu_indices(system.dim, 1)]
 
-    def scale_friction(part):
-        if isinstance(part, Friction):
+    def scale_friction(dissipation):
+        if isinstance(dissipation, Friction):
             root = jnp.sqrt(entropy * tau)
-            unit = pairs / (energy * root) if part.construction == "skew" else s / root
-            inner = _fill_network_scales(part.function, x, jnp.tile(unit, part.rank))
-            return eqx.tree_at(lambda p: (p.function, p.metric), part, (inner, s**2))
-        return part
+            unit = pairs / (energy * root) if dissipation.construction == "skew" else s / root
+            scaled_function = _fill_network_scales(dissipation.function, x, jnp.tile(unit, dissipation.rank))
+            return eqx.tree_at(lambda p: (p.function, p.metric), dissipation, (scaled_function, s**2))
+        return dissipation
 
     def map_leaves(leaf_class, tree, change):
         return jax.tree_util.tree_map(change, tree, is_leaf=lambda part: isinstance(part, leaf_class))
@@ -486,22 +486,22 @@ def scale_networks(system: T, scales: DataScales, points: np.ndarray) -> T:
 
 
 def has_learned_parts(tree: Any) -> bool:
-    """Return True if a pytree has learned parts."""
+    """Return True if a pytree has learned arrays."""
     return any(jax.tree_util.tree_leaves(learned_mask(tree)))
 
 
-def _fill_network_scales(tree: Any, x: jax.Array, output_unit) -> Any:
-    """Set the input scales of the networks in a pytree from points x, and their output unit, unless they are set
-    already."""
+def _fill_network_scales(tree: Any, points: jax.Array, output_scale) -> Any:
+    """Return a pytree whose networks have input scales computed from points, and an output scale, unless they were
+    set."""
 
-    def scale_part(part):
-        if isinstance(part, Pullback):
-            inner = _fill_network_scales(part.term, jax.vmap(part.coordinates)(x), output_unit)
-            return eqx.tree_at(lambda p: p.term, part, inner)
-        if not isinstance(part, Network) or not part.has_default_scales:
-            return part
-        spread = jnp.std(x, axis=0)
-        spread = jnp.where(spread > 0.0, spread, 1.0)
-        return Network(jnp.mean(x, axis=0), spread, output_unit * part.output_scale, part.function)
+    def scale_part(node):
+        if isinstance(node, Pullback):
+            scaled_function = _fill_network_scales(node.term, jax.vmap(node.coordinates)(points), output_scale)
+            return eqx.tree_at(lambda p: p.term, node, scaled_function)
+        if not isinstance(node, Network) or not node.has_default_scales:
+            return node
+        std = jnp.std(points, axis=0)
+        std = jnp.where(std > 0.0, std, 1.0)
+        return Network(jnp.mean(points, axis=0), std, output_scale * node.output_scale, node.function)
 
-    return jax.tree_util.tree_map(scale_part, tree, is_leaf=lambda part: isinstance(part, Pullback | Network))
+    return jax.tree_util.tree_map(scale_part, tree, is_leaf=lambda node: isinstance(node, Pullback | Network))

@@ -74,7 +74,7 @@ class Records(Sequence[Trajectory], metaclass=ListedABCMeta):
         )
 
     def select(self, names: Sequence[str]) -> Records:
-        """Return the records with some of the columns, in the order of ``names``.
+        """Return records that have only the named columns, in this order.
 
         Raises
         ------
@@ -96,7 +96,7 @@ def read_data(
     trajectory: str | None = None,
     units: Mapping[str, str] | None = None,
 ) -> Records:
-    """Return the trajectories in a table: a CSV file, a DataFrame, a dataset of xarray, or arrays with names.
+    """Read trajectories from a table: a CSV file, a DataFrame, a dataset of xarray, or arrays with names.
 
     Columns are found by name. A label such as ``gx [deg/s]`` or ``gx (deg/s)`` is a name with a unit, and an attribute
     ``units`` in xarray is a unit too. Values with a unit are converted to SI units, in which angles are in radians;
@@ -136,19 +136,21 @@ def read_data(
     >>> data.names, data[0].t
     (('angle',), array([0.   , 0.01 , 0.025]))
     """
-    table = _columns_of_source(source, trajectory, time)
+    table = _read_columns(source, trajectory, time)
     labels = _Labels(list(table), units or {})
-    time_label = labels.find_time(time)
-    group_label = None if trajectory is None else labels.find(trajectory, "trajectory=")
+    time_label = labels.find_time_label(time)
+    group_label = None if trajectory is None else labels.find_label(trajectory, "trajectory=")
     if columns is None:
         value_labels = [label for label in table if label not in (time_label, group_label)]
     elif isinstance(columns, str) or not all(isinstance(name, str) for name in columns):
         raise InputError(f"columns must be a list of names, got {columns!r}")
     else:
-        value_labels = [labels.find(name, "columns=") for name in columns]
+        value_labels = [labels.find_label(name, "columns=") for name in columns]
     if not value_labels:
         raise InputError(f"the data have no columns besides the times {labels.names[time_label]!r}")
-    unread_names = [name for name in labels.units if labels.find(name, "units=") not in {time_label, *value_labels}]
+    unread_names = [
+        name for name in labels.units if labels.find_label(name, "units=") not in {time_label, *value_labels}
+    ]
     if unread_names:
         raise InputError(
             f"units has {unread_names[0]!r}, but this column is not read. Remove it, or add it to columns="
@@ -160,8 +162,8 @@ def read_data(
     trajectories = []
     for group in dict.fromkeys(groups.tolist()):
         rows = groups == group
-        owner = "the data" if group_label is None else f"trajectory {group}"
-        trajectories.append(_checked_rows(owner, t[rows], x[rows], names, group_label is None))
+        trajectory_name = "the data" if group_label is None else f"trajectory {group}"
+        trajectories.append(_checked_trajectory(trajectory_name, t[rows], x[rows], names, group_label is None))
     return Records(names, tuple(trajectories))
 
 
@@ -176,7 +178,7 @@ def is_table(data: Any) -> bool:
 
 
 def _is_instance_of(value: Any, module: str, *classes: str) -> bool:
-    """Return True for an instance of a class of a module, which is not imported for it."""
+    """Return True if a value is an instance of a class of a module, without importing that module."""
     return module in sys.modules and isinstance(value, tuple(vars(sys.modules[module])[name] for name in classes))
 
 
@@ -190,25 +192,28 @@ class _Labels:
         self.names = {label: split_label(label)[0] for label in labels}
         self.units = dict(units)
 
-    def find(self, name: str, argument: str) -> str:
-        """Return the label of the column that has a name; a whole label is returned unchanged.
+    def find_label(self, name_or_label: str, argument_name: str) -> str:
+        """Return the label of the column with a name; a label with a unit is returned unchanged.
 
         Raises
         ------
         InputError
         """
-        if name in self.names:
-            return name
-        matches = [label for label, short_name in self.names.items() if short_name == name]
+        if name_or_label in self.names:
+            return name_or_label
+        matches = [label for label, short_name in self.names.items() if short_name == name_or_label]
         if len(matches) == 1:
             return matches[0]
         if matches:
-            raise InputError(f"several columns are called {name!r}. Give {argument} the whole label, {matches[0]!r}")
-        raise InputError(f"the data have no column {name!r}; their columns are {', '.join(self.names)}")
+            raise InputError(
+                f"several columns are called {name_or_label!r}. Give {argument_name} the whole label, {matches[0]!r}"
+            )
+        raise InputError(f"the data have no column {name_or_label!r}; their columns are {', '.join(self.names)}")
 
-    def find_time(self, time: str | None) -> str:
+    def find_time_label(self, time: str | None) -> str:
+        """Return the label of the column of times, given by its name, or found if ``time`` is None."""
         if time is not None:
-            return self.find(time, "time=")
+            return self.find_label(time, "time=")
         matches = [label for label, name in self.names.items() if name.lower() in TIME_NAMES]
         if len(matches) != 1:
             problem = (
@@ -217,21 +222,21 @@ class _Labels:
             raise InputError(f"{problem}; their columns are {', '.join(self.names)}. Name the times with time=")
         return matches[0]
 
-    def unit(self, label: str) -> str:
-        """Return the unit of a column as text: the one that is given, or the one in the label."""
+    def unit_text(self, label: str) -> str:
+        """Return the unit of a column as text: the user's, or the one in the label."""
         for name in (label, self.names[label]):
             if name in self.units:
                 return self.units[name]
         return split_label(label)[1]
 
-    def parse(self, label: str):
-        """Return the unit of a column.
+    def parse_unit(self, label: str):
+        """Return the :class:`.Unit` of a column.
 
         Raises
         ------
         InputError
         """
-        text = self.unit(label)
+        text = self.unit_text(label)
         if not isinstance(text, str):
             raise InputError(f"units must be names such as 'deg/s', got {text!r} for {self.names[label]!r}")
         try:
@@ -242,43 +247,54 @@ class _Labels:
 
 
 def _time_column(values: np.ndarray, labels: _Labels, label: str) -> np.ndarray:
+    """Convert a column of times to seconds; dates count from the first one.
+
+    Raises
+    ------
+    InputError
+        If a date is missing or dates have a unit, the unit is none of time, or values are not numbers.
+    """
     if values.dtype.kind in "OUS" and not all(map(_converts_to_float, values)):
         with contextlib.suppress(TypeError, ValueError):
             values = values.astype("datetime64[ns]")
     if values.dtype.kind in "mM":  # dates and durations
-        if labels.unit(label):
+        if labels.unit_text(label):
             raise InputError(f"the times {labels.names[label]!r} are dates, which have no unit. Leave it out of units=")
         if np.isnat(values).any():
             raise InputError(f"the times {labels.names[label]!r} have missing values. Remove these rows")
         return (values - values[0]) / np.timedelta64(1, "ns") * 1e-9
-    unit = labels.parse(label)
+    unit = labels.parse_unit(label)
     if unit.dimension not in (TIME, ()):
         raise InputError(
-            f"the times {labels.names[label]!r} are in {labels.unit(label)!r}. Give a unit of time, as 's'"
+            f"the times {labels.names[label]!r} are in {labels.unit_text(label)!r}. Give a unit of time, as 's'"
         )
-    return unit.to_si(_numbers(values, label))
+    return unit.to_si(_to_floats(values, label))
 
 
 def _value_column(values: np.ndarray, labels: _Labels, label: str) -> np.ndarray:
-    column = labels.parse(label).to_si(_numbers(values, label))
+    """Convert a column of observations to SI units; raise InputError if it has no values or some are not numbers."""
+    column = labels.parse_unit(label).to_si(_to_floats(values, label))
     if np.isnan(column).all():
         raise InputError(f"column {labels.names[label]!r} has no values, only missing ones. Remove it with columns=")
     return column
 
 
-def _numbers(values: np.ndarray, label: str) -> np.ndarray:
+def _to_floats(values: np.ndarray, label: str) -> np.ndarray:
+    """Convert a column to floats; raise InputError, with the label of the column, if a value is not a number."""
     try:
         if values.dtype.kind not in "biufO":
             raise TypeError
         return values.astype(np.float64)
     except (TypeError, ValueError):
-        example = next((value for value in values.tolist() if not _converts_to_float(value)), values[0])
+        first_invalid_value = next((value for value in values.tolist() if not _converts_to_float(value)), values[0])
         raise InputError(
-            f"column {label!r} must have numbers, got {example!r:.60}. Name the columns to read with columns="
+            f"column {label!r} must have numbers, got {first_invalid_value!r:.60}. "
+            "Name the columns to read with columns="
         ) from None
 
 
 def _converts_to_float(value: Any) -> bool:
+    """Return True if ``float(value)`` succeeds."""
     try:
         float(value)
     except (TypeError, ValueError):
@@ -286,8 +302,10 @@ def _converts_to_float(value: Any) -> bool:
     return True
 
 
-def _checked_rows(owner: str, t: np.ndarray, x: np.ndarray, names: Sequence[str], is_whole: bool) -> Trajectory:
-    """Return one trajectory, without the rows of the record that are empty.
+def _checked_trajectory(
+    trajectory_name: str, t: np.ndarray, x: np.ndarray, names: Sequence[str], is_only_trajectory: bool
+) -> Trajectory:
+    """Return a trajectory made of the rows of a table that have values, after checking them.
 
     Raises
     ------
@@ -296,39 +314,49 @@ def _checked_rows(owner: str, t: np.ndarray, x: np.ndarray, names: Sequence[str]
     """
     if not np.isfinite(t).all():
         row = int(np.flatnonzero(~np.isfinite(t))[0])
-        raise InputError(f"{owner}: time {row} is {t[row]}. Remove the rows without a time")
+        raise InputError(f"{trajectory_name}: time {row} is {t[row]}. Remove the rows without a time")
     has_value = ~np.isnan(x).all(axis=1)
     t, x = t[has_value], x[has_value]
     if len(t) < 2:
         raise InputError(
-            f"{owner}: {len(t)} row{'s' if len(t) != 1 else ''} with values, at least 2 are needed for a fit"
+            f"{trajectory_name}: {len(t)} row{'s' if len(t) != 1 else ''} with values, at least 2 are needed for a fit"
         )
     i = int(np.argmax(np.diff(t) <= 0.0))
     if t[i + 1] == t[i]:
-        raise InputError(f"{owner}: time {t[i]:.6g} occurs twice. Keep one of these rows, or their mean")
+        raise InputError(f"{trajectory_name}: time {t[i]:.6g} occurs twice. Keep one of these rows, or their mean")
     if t[i + 1] < t[i]:
         advice = (
             "Sort the rows by time; if they are several trajectories, name the column that numbers them with "
             "trajectory="
-            if is_whole
+            if is_only_trajectory
             else "Sort the rows by time"
         )
-        raise InputError(f"{owner}: times must grow, but time {i + 1} is {t[i + 1]:.6g} after {t[i]:.6g}. {advice}")
-    empty = [name for name, column in zip(names, x.T, strict=True) if np.isnan(column).all()]
-    if empty:
-        raise InputError(f"{owner}: column {empty[0]!r} has no values. Leave out this trajectory, or the column")
+        raise InputError(
+            f"{trajectory_name}: times must grow, but time {i + 1} is {t[i + 1]:.6g} after {t[i]:.6g}. {advice}"
+        )
+    empty_columns = [name for name, column in zip(names, x.T, strict=True) if np.isnan(column).all()]
+    if empty_columns:
+        raise InputError(
+            f"{trajectory_name}: column {empty_columns[0]!r} has no values. Leave out this trajectory, or the column"
+        )
     return Trajectory(t, x)
 
 
 # -- sources ----------------------------------------------------------------------------------------------------------
 
 
-def _columns_of_source(source: Any, trajectory: str | None, time: str | None) -> dict[str, np.ndarray]:
-    """Return the columns of a table by label, all of one length."""
+def _read_columns(source: Any, trajectory: str | None, time: str | None) -> dict[str, np.ndarray]:
+    """Read all columns of a table as arrays of equal length, by label.
+
+    Raises
+    ------
+    FileError, InputError
+        If the file cannot be read, the source is no table, or columns differ in length.
+    """
     if isinstance(source, str | os.PathLike):
-        return _columns_of_frame(_read_csv(Path(source)))
+        return _columns_of_dataframe(_read_csv(Path(source)))
     if _is_instance_of(source, "pandas", "DataFrame"):
-        return _columns_of_frame(source)
+        return _columns_of_dataframe(source)
     if _is_instance_of(source, "xarray", "DataArray"):
         return _columns_of_dataset(
             source.to_dataset(name="x" if source.name is None else source.name), trajectory, time
@@ -351,7 +379,13 @@ def _columns_of_source(source: Any, trajectory: str | None, time: str | None) ->
 
 
 def _read_csv(path: Path):
-    """Return a file as a DataFrame; its separator is the most frequent one in the line of names."""
+    """Read a CSV file into a DataFrame; the separator is the most frequent one in the header line.
+
+    Raises
+    ------
+    FileError
+        If the file does not exist, is no table, or has no header line.
+    """
     import pandas
 
     try:
@@ -373,8 +407,9 @@ def _read_csv(path: Path):
     return frame
 
 
-def _columns_of_frame(frame) -> dict[str, np.ndarray]:
-    columns = {str(name).strip(): _array_of_series(frame[name]) for name in frame.columns}
+def _columns_of_dataframe(frame) -> dict[str, np.ndarray]:
+    """Return the columns and named indices of a DataFrame as arrays, by name; raise InputError if names are equal."""
+    columns = {str(name).strip(): _series_to_array(frame[name]) for name in frame.columns}
     if len(columns) < len(frame.columns):
         raise InputError(f"the table has several columns of one name: {', '.join(map(str, frame.columns))}")
     for name in frame.index.names:
@@ -383,8 +418,8 @@ def _columns_of_frame(frame) -> dict[str, np.ndarray]:
     return columns
 
 
-def _array_of_series(series) -> np.ndarray:
-    """Return a column as an array, missing values of any kind as NaN."""
+def _series_to_array(series) -> np.ndarray:
+    """Convert a pandas Series to an array; missing values become NaN."""
     if series.dtype.kind in "biufcmM" and isinstance(series.dtype, np.dtype):
         return series.to_numpy()
     if series.dtype.kind == "M":  # dates with a time zone
@@ -395,7 +430,13 @@ def _array_of_series(series) -> np.ndarray:
 
 
 def _columns_of_dataset(dataset, trajectory: str | None, time: str | None) -> dict[str, np.ndarray]:
-    """Return the variables of a dataset as columns; rows of several trajectories follow one another."""
+    """Return the variables of an xarray dataset as columns by label, with the trajectories one after another.
+
+    Raises
+    ------
+    InputError
+        If there are no variables with dimensions, or no coordinate of the times.
+    """
     variables = {str(name): variable for name, variable in dataset.data_vars.items() if variable.dims}
     if not variables:
         raise InputError("the dataset has no variables with dimensions")

@@ -62,7 +62,7 @@ class PaddedRuns(NamedTuple):
     Attributes
     ----------
     states : array, shape (B, m + 1, N)
-        Guesses of the states at all times; a run starts from those at the starts of its pieces.
+        Guesses of the states at all times; a run starts from those at the starts of its segments.
     intervals : array, shape (B, m)
         Time intervals; after the end of a trajectory its last interval is repeated.
     observations : array, shape (B, m + 1, k)
@@ -78,26 +78,26 @@ class PaddedRuns(NamedTuple):
     times: np.ndarray
 
 
-class Piece(NamedTuple):
-    """Consecutive times of a trajectory that one run from an initial state of its own describes.
+class TrajectorySegment(NamedTuple):
+    """Consecutive times of a trajectory that are predicted by one run, from an initial state that is fitted.
 
     Attributes
     ----------
-    run : int
+    trajectory_index : int
         Index of the trajectory.
     start, stop : int
-        Index of the first time, and of the first time after the piece.
+        Index of the first time, and of the first time after the segment.
     """
 
-    run: int
+    trajectory_index: int
     start: int
     stop: int
 
 
-def whole_trajectories(runs: PaddedRuns) -> list[Piece]:
-    """Return one piece for each trajectory."""
+def segments_of_whole_trajectories(runs: PaddedRuns) -> list[TrajectorySegment]:
+    """Return one segment for each trajectory, over all its times."""
     n_runs, n_times = runs.times.shape
-    return [Piece(i, 0, n_times) for i in range(n_runs)]
+    return [TrajectorySegment(i, 0, n_times) for i in range(n_runs)]
 
 
 class LeastSquaresResult(NamedTuple):
@@ -123,8 +123,8 @@ class LeastSquaresResult(NamedTuple):
     degrees_of_freedom : int
         Number of observations minus the number of determined unknowns.
     states : array, shape (B, m + 1, N)
-        The states of the runs, fitted at the starts of the pieces.
-    mean_squares : array, shape (k,)
+        The states of the runs, fitted at the starts of the segments.
+    residual_variances : array, shape (k,)
         Mean square of the residuals of each observed number, by degrees of freedom, in the units of the fit.
     """
 
@@ -139,33 +139,38 @@ class LeastSquaresResult(NamedTuple):
     iterations: int
     degrees_of_freedom: int
     states: np.ndarray
-    mean_squares: np.ndarray
+    residual_variances: np.ndarray
 
 
-def can_refine(params: ParameterVector, system: Any, data: list[Trajectory], prepared_system, substeps: int) -> bool:
-    """Return True if least squares over whole trajectories are affordable and the parameters can be determined.
+def can_refine_by_least_squares(
+    params: ParameterVector, system: Any, trajectories: list[Trajectory], prepared_system, substeps: int
+) -> bool:
+    """Return True if a least-squares fit over whole trajectories is affordable and can determine the parameters.
 
     The weights of a perceptron are not determined by its function.
     """
-    count = params.initial_values.size
+    n_parameters = params.initial_values.size
     if any(map(_is_perceptron, jax.tree_util.tree_leaves(system, is_leaf=_is_perceptron))):
         return False
-    steps = substeps * sum(len(t) - 1 for t, _ in data)
-    return count <= MAX_PARAMETERS and steps * (count + n_displacement_coordinates(prepared_system)) <= MAX_COLUMN_STEPS
+    steps = substeps * sum(len(t) - 1 for t, _ in trajectories)
+    return (
+        n_parameters <= MAX_PARAMETERS
+        and steps * (n_parameters + n_displacement_coordinates(prepared_system)) <= MAX_COLUMN_STEPS
+    )
 
 
 def _is_perceptron(part: Any) -> bool:
     return isinstance(part, Perceptron)
 
 
-def pad_runs(data: list[Trajectory], states: list[np.ndarray]) -> PaddedRuns:
-    """Pad trajectories, and the guesses of their states, shape (m, N) each, to one length."""
-    length = max(len(t) for t, _ in data)
-    rows = []
-    for (t, x), trajectory_states in zip(data, states, strict=True):
+def pad_runs(trajectories: list[Trajectory], states: list[np.ndarray]) -> PaddedRuns:
+    """Pad trajectories, and guesses of their states, shape (m, N) each, to equal length; return them stacked."""
+    length = max(len(t) for t, _ in trajectories)
+    padded_arrays = []
+    for (t, x), trajectory_states in zip(trajectories, states, strict=True):
         n_missing = length - len(t)
         intervals = np.append(np.diff(t), np.full(n_missing, t[-1] - t[-2]))
-        rows.append(
+        padded_arrays.append(
             (
                 np.concatenate([trajectory_states, np.repeat(trajectory_states[-1:], n_missing, axis=0)]),
                 intervals,
@@ -174,11 +179,11 @@ def pad_runs(data: list[Trajectory], states: list[np.ndarray]) -> PaddedRuns:
                 np.concatenate([t, t[-1] + intervals[-1] * np.arange(1, n_missing + 1)]),
             )
         )
-    return PaddedRuns(*map(np.stack, zip(*rows, strict=True)))
+    return PaddedRuns(*map(np.stack, zip(*padded_arrays, strict=True)))
 
 
 class RunModel:
-    """The observations of runs and their derivatives, in one compiled program for all pieces and steps.
+    """Compiled model of a fit that predicts the observations of runs, with derivatives.
 
     Parameters
     ----------
@@ -190,54 +195,63 @@ class RunModel:
     def __init__(self, params: ParameterVector, method: OneStepMethod, observation: Observation):
         self.params, self.method, self.observation = params, method, observation
         initial_weights = jnp.asarray(params.initial_values)
-        system = self._stepper(initial_weights, 1).system
+        system = self._differentiable_stepper(initial_weights, 1).system
         self.n_coordinates = n_displacement_coordinates(system)
-        self._evaluate = jax.jit(self._predictions_of_runs, compiler_options=fast_compile_options())
+        self._evaluate = jax.jit(self._predictions_and_derivatives, compiler_options=fast_compile_options())
         self._displace = jax.jit(
-            jax.vmap(lambda x, z: observation.displace(self._stepper(initial_weights, 1).system, x, z))
+            jax.vmap(lambda x, z: observation.displace(self._differentiable_stepper(initial_weights, 1).system, x, z))
         )
 
-    def _stepper(self, weights, substeps):
+    def _differentiable_stepper(self, weights, substeps):
         has_attitude = self.observation.group is not None
         return differentiable_stepper(self.params.build_system(weights), self.method, substeps, has_attitude)
 
     def displace(self, states: np.ndarray, displacements: np.ndarray) -> np.ndarray:
-        """Return states displaced by coordinates, one row each."""
+        """Return states displaced by tangent coordinates, both with one row for each state."""
         return np.asarray(self._displace(jnp.asarray(states), jnp.asarray(displacements)))
 
     def predict(
-        self, weights: np.ndarray, runs: PaddedRuns, states: np.ndarray, pieces: list[Piece], substeps: int
+        self,
+        weights: np.ndarray,
+        runs: PaddedRuns,
+        states: np.ndarray,
+        segments: list[TrajectorySegment],
+        substeps: int,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the observations of runs, shape (B, m + 1, k), and their derivatives by the weights and by the
-        displacement of the initial state of their own piece, shape (B, m + 1, k, p + c)."""
+        """Predict the observations of runs, shape (B, m + 1, k), and their derivatives, shape (B, m + 1, k, p + c).
+
+        The derivatives are by the p weights, and by the c coordinates that displace the initial state of the segment.
+        """
         is_start = np.zeros(runs.times.shape, bool)
-        for piece in pieces:
-            is_start[piece.run, piece.start] = True
+        for segment in segments:
+            is_start[segment.trajectory_index, segment.start] = True
         arrays = states, is_start, runs.intervals, runs.times
         values, derivatives = self._evaluate(jnp.asarray(weights), substeps, *map(jnp.asarray, arrays))
         return np.asarray(values), np.asarray(derivatives)
 
-    def _predictions(self, weights, z, substeps, states, is_start, intervals, times):
-        run, init, advance, get_state = self._stepper(weights, substeps)
+    def _predictions_of_run(self, weights, displacement, substeps, states, is_start, intervals, times):
+        prepared_system, init, advance, get_state = self._differentiable_stepper(weights, substeps)
         values = self.params.parameters_of(weights)
 
-        def next_carry(carry, slot):
-            h, state, starts_here, t = slot
-            fresh = init(self.observation.displace(run, state, z))
-            carry = jax.tree_util.tree_map(lambda a, b: jnp.where(starts_here, a, b), fresh, advance(carry, h))
-            return carry, self.observation.observe(run, get_state(carry), t, values)
+        def next_carry(carry, inputs):
+            h, state, starts_here, t = inputs
+            restarted_carry = init(self.observation.displace(prepared_system, state, displacement))
+            carry = jax.tree_util.tree_map(
+                lambda a, b: jnp.where(starts_here, a, b), restarted_carry, advance(carry, h)
+            )
+            return carry, self.observation.observe(prepared_system, get_state(carry), t, values)
 
-        first = init(self.observation.displace(run, states[0], z))
-        first_observation = self.observation.observe(run, get_state(first), times[0], values)
-        slots = intervals, states[1:], is_start[1:], times[1:]
-        return jnp.concatenate([first_observation[None], jax.lax.scan(next_carry, first, slots)[1]])
+        initial_carry = init(self.observation.displace(prepared_system, states[0], displacement))
+        initial_observation = self.observation.observe(prepared_system, get_state(initial_carry), times[0], values)
+        inputs_per_time = intervals, states[1:], is_start[1:], times[1:]
+        return jnp.concatenate([initial_observation[None], jax.lax.scan(next_carry, initial_carry, inputs_per_time)[1]])
 
-    def _predictions_of_runs(self, weights, substeps, *arrays):
+    def _predictions_and_derivatives(self, weights, substeps, *arrays):
         p = weights.size
 
         def value_and_derivative(arrays):
             def predict_from(v):
-                predictions = self._predictions(weights + v[:p], v[p:], substeps, *arrays)
+                predictions = self._predictions_of_run(weights + v[:p], v[p:], substeps, *arrays)
                 return predictions, predictions
 
             derivative, value = jax.jacfwd(predict_from, has_aux=True)(jnp.zeros(p + self.n_coordinates))
@@ -247,42 +261,46 @@ class RunModel:
 
 
 class NormalEquations(NamedTuple):
-    """``J^T J``, ``J^T r`` and the squares of the residuals r of each piece, the weights first.
+    """Normal equations of each segment, from its residuals r and their Jacobian J.
 
     Attributes
     ----------
-    squares : array, shape (pieces, p + c, p + c)
-    slopes : array, shape (pieces, p + c)
-    column_costs : array, shape (pieces, k)
+    matrices : array, shape (segments, p + c, p + c)
+        ``J^T J``; the p weights come before the c coordinates of the initial state.
+    gradients : array, shape (segments, p + c)
+        ``J^T r``.
+    column_costs : array, shape (segments, k)
+        Sum of the squared residuals of each observed component.
     """
 
-    squares: np.ndarray
-    slopes: np.ndarray
+    matrices: np.ndarray
+    gradients: np.ndarray
     column_costs: np.ndarray
 
     @property
     def costs(self) -> np.ndarray:
-        """Sum of the squares of each piece, shape (pieces,)."""
+        """Sum of the squared residuals of each segment, shape (segments,)."""
         return self.column_costs.sum(axis=1)
 
     @property
     def is_finite(self) -> np.ndarray:
-        """True for pieces whose residuals and derivatives are finite, shape (pieces,)."""
-        return np.isfinite(self.costs) & np.isfinite(self.squares).all(axis=(1, 2))
+        """True for segments whose residuals and derivatives are finite, shape (segments,)."""
+        return np.isfinite(self.costs) & np.isfinite(self.matrices).all(axis=(1, 2))
 
 
 def _normal_equations(
-    predictions: np.ndarray, derivatives: np.ndarray, runs: PaddedRuns, pieces: list[Piece], units
+    predictions: np.ndarray, derivatives: np.ndarray, runs: PaddedRuns, segments: list[TrajectorySegment], units
 ) -> NormalEquations:
+    """Return the normal equations of each segment from predictions, their derivatives and the observations."""
     data_unit, search_unit = units
     n_weights = derivatives.shape[-1] - len(search_unit)
     column_scale = np.append(np.ones(n_weights), search_unit)
     equations = []
-    for i, start, stop in pieces:
+    for i, start, stop in segments:
         is_observed = runs.is_observed[i, start:stop]
-        rows = slice(start, stop)
-        r = np.where(is_observed, (predictions[i, rows] - runs.observations[i, rows]) / data_unit, 0.0)
-        J = np.where(is_observed[..., None], derivatives[i, rows] * column_scale / data_unit[:, None], 0.0)
+        time_slice = slice(start, stop)
+        r = np.where(is_observed, (predictions[i, time_slice] - runs.observations[i, time_slice]) / data_unit, 0.0)
+        J = np.where(is_observed[..., None], derivatives[i, time_slice] * column_scale / data_unit[:, None], 0.0)
         J = J.reshape(-1, len(column_scale))
         with np.errstate(invalid="ignore", over="ignore"):  # runs that leave the domain are refused by their costs
             equations.append((J.T @ J, J.T @ r.ravel(), np.sum(r**2, axis=0)))
@@ -293,17 +311,18 @@ def refine_by_least_squares(
     model: RunModel,
     weights: np.ndarray,
     runs: PaddedRuns,
-    pieces: list[Piece],
+    segments: list[TrajectorySegment],
     is_held_out: np.ndarray,
     units: tuple[np.ndarray, np.ndarray],
     substeps: int,
     tolerance: float = NEWTON_STEP_TOLERANCE,
     max_iterations: int = MAX_ITERATIONS,
 ) -> LeastSquaresResult:
-    """Minimise the squared residuals of runs over the weights and the initial states.
+    """Minimise the sum of squared residuals of runs over the weights and the initial states of the segments.
 
-    The method is Levenberg-Marquardt. Each initial state affects one piece only, so the normal equations of the weights
-    are a Schur complement. Initial states of held-out trajectories are fitted too, without effect on the weights.
+    The method is Levenberg-Marquardt. Each initial state affects one segment only, so the normal equations of the
+    weights are a Schur complement. Initial states of held-out trajectories are fitted too, without effect on the
+    weights.
 
     Parameters
     ----------
@@ -311,8 +330,8 @@ def refine_by_least_squares(
     weights : array, shape (p,)
         Initial weights.
     runs : PaddedRuns
-    pieces : list of Piece
-        Parts of the trajectories that have an initial state of their own; :func:`whole_trajectories` for long runs.
+    segments : list of TrajectorySegment
+        Parts of the trajectories that have separate initial states, such as :func:`segments_of_whole_trajectories`.
     is_held_out : array of bool, shape (B,)
     units : two arrays, shapes (k,), (coordinates of a state,)
         Units of the observations, and of the search for initial states.
@@ -320,14 +339,14 @@ def refine_by_least_squares(
         Newton step of the weights, in standard errors, below which the iteration has converged.
     """
     search_unit = np.asarray(units[1])
-    piece_run = np.array([piece.run for piece in pieces])
-    starts = piece_run, np.array([piece.start for piece in pieces])
-    is_training = ~np.asarray(is_held_out)[piece_run]
-    counts = np.array([runs.is_observed[i, start:stop].sum() for i, start, stop in pieces])
-    p, is_log = len(weights), model.params.is_log
+    trajectory_of_segment = np.array([segment.trajectory_index for segment in segments])
+    starts = trajectory_of_segment, np.array([segment.start for segment in segments])
+    is_training = ~np.asarray(is_held_out)[trajectory_of_segment]
+    n_observations = np.array([runs.is_observed[i, start:stop].sum() for i, start, stop in segments])
+    n_weights, is_log = len(weights), model.params.is_log
 
     def evaluate(weights, states) -> NormalEquations:
-        return _normal_equations(*model.predict(weights, runs, states, pieces, substeps), runs, pieces, units)
+        return _normal_equations(*model.predict(weights, runs, states, segments, substeps), runs, segments, units)
 
     weights, states = np.asarray(weights, dtype=np.float64), np.asarray(runs.states)
     initial_weights = model.params.initial_values
@@ -335,22 +354,24 @@ def refine_by_least_squares(
     if not equations.is_finite[is_training].all():
         return _failed_result(weights, runs)
     damping, converged, iterations = INITIAL_DAMPING, False, 0
-    degrees_of_freedom = _degrees_of_freedom(counts, equations.squares[:, p:, p:], is_training, p)
+    degrees_of_freedom = _degrees_of_freedom(
+        n_observations, equations.matrices[:, n_weights:, n_weights:], is_training, n_weights
+    )
     variance = equations.costs[is_training].sum() / max(degrees_of_freedom, 1)
     exact_variance = EXACT_RTOL**2 * np.mean((runs.observations / units[0]) ** 2)
     while iterations < max_iterations and damping < MAX_DAMPING:
-        squares_with_prior = _add_prior(equations.squares, p, variance)
-        schur, _ = _schur_complement(squares_with_prior, equations.slopes, p, is_training)
-        newton = _gauss_newton_step(squares_with_prior, equations.slopes, p, is_training, 0.0)
+        matrices_with_prior = _add_initial_state_prior(equations.matrices, n_weights, variance)
+        schur, _ = _schur_complement(matrices_with_prior, equations.gradients, n_weights, is_training)
+        newton = _gauss_newton_step(matrices_with_prior, equations.gradients, n_weights, is_training, 0.0)
         newton_step_norm = np.sqrt(max(newton @ schur @ newton, 0.0) / variance) if variance > 0.0 else 0.0
         converged = bool(newton_step_norm <= tolerance or variance <= exact_variance)
         vanishes = (initial_weights - weights)[is_log].max(initial=0.0) > MAX_LOG_DECREASE
         if (converged and iterations > 0) or vanishes:
             break
         iterations += 1
-        step = _gauss_newton_step(squares_with_prior, equations.slopes, p, is_training, damping)
+        step = _gauss_newton_step(matrices_with_prior, equations.gradients, n_weights, is_training, damping)
         step[is_log] = np.clip(step[is_log], -MAX_LOG_STEP, MAX_LOG_STEP)
-        displacements = _displacements(squares_with_prior, equations.slopes, step, damping)
+        displacements = _initial_state_steps(matrices_with_prior, equations.gradients, step, damping)
         new_weights, new_states = weights + step, states.copy()
         new_states[starts] = model.displace(states[starts], displacements * search_unit)
         new_equations = evaluate(new_weights, new_states)
@@ -367,20 +388,22 @@ def refine_by_least_squares(
             break
         else:
             damping *= DAMPING_INCREASE
-    squares, slopes, costs = equations.squares, equations.slopes, equations.costs
-    schur, slope = _schur_complement(_add_prior(squares, p, variance), slopes, p, is_training)
+    matrices, gradients, costs = equations.matrices, equations.gradients, equations.costs
+    schur, slope = _schur_complement(
+        _add_initial_state_prior(matrices, n_weights, variance), gradients, n_weights, is_training
+    )
     total = costs[is_training].sum()
     variance = total / degrees_of_freedom if degrees_of_freedom > 0 else np.nan
     inverse, _, condition = _inverse_rank_and_condition(schur)
-    weight_diagonal = np.diag(squares[is_training].sum(axis=0))[:p]  # with the first states known
+    weight_diagonal = np.diag(matrices[is_training].sum(axis=0))[:n_weights]  # with the first states known
     without_prior, rank, _ = _inverse_rank_and_condition(
-        _schur_complement(squares, slopes, p, is_training)[0], weight_diagonal
+        _schur_complement(matrices, gradients, n_weights, is_training)[0], weight_diagonal
     )
-    if rank < p:  # the prior alone determines the rest
+    if rank < n_weights:  # the prior alone determines the rest
         inverse, condition = np.where(np.isinf(without_prior), np.inf, inverse), np.inf
     held_out_residual = np.nan
     if not is_training.all() and equations.is_finite[~is_training].all():
-        held_out_freedom = _degrees_of_freedom(counts, squares[:, p:, p:], ~is_training, 0)
+        held_out_freedom = _degrees_of_freedom(n_observations, matrices[:, n_weights:, n_weights:], ~is_training, 0)
         held_out_residual = np.sqrt(costs[~is_training].sum() / held_out_freedom) if held_out_freedom > 0 else np.nan
     gradient = 2.0 * float(np.linalg.norm(slope)) / total if total > 0.0 else 0.0
     with np.errstate(invalid="ignore"):
@@ -398,18 +421,19 @@ def refine_by_least_squares(
         iterations,
         degrees_of_freedom,
         states,
-        _mean_squares(equations.column_costs[is_training], runs.is_observed[is_training_run], degrees_of_freedom),
+        _residual_variances(equations.column_costs[is_training], runs.is_observed[is_training_run], degrees_of_freedom),
     )
 
 
-def _mean_squares(column_costs: np.ndarray, is_observed: np.ndarray, degrees_of_freedom: int) -> np.ndarray:
-    """Return the residual variance of each observed component; each loses an equal share of the fitted parameters."""
+def _residual_variances(column_costs: np.ndarray, is_observed: np.ndarray, degrees_of_freedom: int) -> np.ndarray:
+    """Return the residual variance of each observed component, with the degrees of freedom divided among them."""
     counts = is_observed.sum(axis=(0, 1))
     share = degrees_of_freedom / counts.sum() if degrees_of_freedom > 0 else np.nan
     return column_costs.sum(axis=0) / (np.maximum(counts, 1) * share)
 
 
 def _failed_result(weights, runs: PaddedRuns) -> LeastSquaresResult:
+    """Return a result that has not converged, with the initial weights and NaN for all estimates."""
     nan, start = np.full((len(weights),) * 2, np.nan), np.asarray(runs.states)
     nan_squares = np.full(runs.observations.shape[-1], np.nan)
     return LeastSquaresResult(
@@ -417,23 +441,24 @@ def _failed_result(weights, runs: PaddedRuns) -> LeastSquaresResult:
     )
 
 
-def _add_prior(normal_matrices: np.ndarray, n_weights: int, variance: float) -> np.ndarray:
+def _add_initial_state_prior(normal_matrices: np.ndarray, n_weights: int, variance: float) -> np.ndarray:
+    """Return normal matrices with a weak prior added to the diagonal entries of the initial states."""
     prior = np.where(np.arange(normal_matrices.shape[-1]) < n_weights, 0.0, INITIAL_STATE_PRIOR * variance)
     return normal_matrices + np.diag(prior)
 
 
-def _degrees_of_freedom(counts, initial_state_normal_matrices, is_selected, n_weights: int) -> int:
-    """Return the number of observations minus the number of determined unknowns: weights, and parts of initial
+def _degrees_of_freedom(n_observations, initial_state_normal_matrices, is_selected, n_weights: int) -> int:
+    """Return the number of observations minus the number of unknowns: weights, and determined components of initial
     states."""
     n_determined = sum(
         int((np.linalg.eigvalsh(square) > INITIAL_STATE_PRIOR).sum())
         for square in initial_state_normal_matrices[is_selected]
     )
-    return int(counts[is_selected].sum()) - n_weights - n_determined
+    return int(n_observations[is_selected].sum()) - n_weights - n_determined
 
 
 def _pseudo_inverse(normal_matrix: np.ndarray, damping: float = 0.0) -> np.ndarray:
-    """Return the inverse of a normal matrix with damped diagonal, restricted to the combinations that it determines."""
+    """Return the pseudo-inverse of a scaled normal matrix with a damped diagonal."""
     diagonal = np.diag(normal_matrix)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     scaled = normal_matrix * np.outer(scale, scale) + damping * np.eye(len(normal_matrix))
@@ -443,33 +468,38 @@ def _pseudo_inverse(normal_matrix: np.ndarray, damping: float = 0.0) -> np.ndarr
 def _schur_complement(
     normal_matrices, gradients, n_weights: int, is_training, damping: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the normal matrix and the gradient of the weights after eliminating the initial states of all runs."""
-    matrix, slope = np.zeros((n_weights, n_weights)), np.zeros(n_weights)
+    """Eliminate the initial states from the normal equations; return the normal matrix and the gradient of the
+    weights."""
+    matrix, gradient = np.zeros((n_weights, n_weights)), np.zeros(n_weights)
     for S, g in zip(normal_matrices[is_training], gradients[is_training], strict=True):
         elimination = S[:n_weights, n_weights:] @ _pseudo_inverse(S[n_weights:, n_weights:], damping)
         matrix += S[:n_weights, :n_weights] - elimination @ S[n_weights:, :n_weights]
-        slope += g[:n_weights] - elimination @ g[n_weights:]
-    return 0.5 * (matrix + matrix.T), slope
+        gradient += g[:n_weights] - elimination @ g[n_weights:]
+    return 0.5 * (matrix + matrix.T), gradient
 
 
 def _gauss_newton_step(normal_matrices, gradients, n_weights: int, is_training, damping: float) -> np.ndarray:
     """Return the damped Gauss-Newton step of the weights, shape (p,)."""
-    matrix, slope = _schur_complement(normal_matrices, gradients, n_weights, is_training, damping)
-    return -_pseudo_inverse(matrix, damping) @ slope
+    matrix, gradient = _schur_complement(normal_matrices, gradients, n_weights, is_training, damping)
+    return -_pseudo_inverse(matrix, damping) @ gradient
 
 
-def _displacements(normal_matrices, gradients, step: np.ndarray, damping: float) -> np.ndarray:
-    """Return the damped Gauss-Newton step of the initial states for a step of the weights, shape (pieces, c)."""
-    p = len(step)
-    displacements = [
-        -_pseudo_inverse(S[p:, p:], damping) @ (g[p:] + S[p:, :p] @ step) if np.isfinite(S).all() else 0.0 * g[p:]
+def _initial_state_steps(normal_matrices, gradients, weight_step: np.ndarray, damping: float) -> np.ndarray:
+    """Return the damped Gauss-Newton step of the initial states, shape (segments, c), for a given step of the
+    weights."""
+    p = len(weight_step)
+    state_steps = [
+        -_pseudo_inverse(S[p:, p:], damping) @ (g[p:] + S[p:, :p] @ weight_step)
+        if np.isfinite(S).all()
+        else 0.0 * g[p:]
         for S, g in zip(normal_matrices, gradients, strict=True)
     ]
-    return np.stack(displacements)
+    return np.stack(state_steps)
 
 
 def _inverse_rank_and_condition(schur: np.ndarray, diagonal: np.ndarray | None = None) -> tuple[np.ndarray, int, float]:
-    """Return the inverse of a normal matrix, infinite where singular, its rank, and the condition number of its root.
+    """Return the inverse of a normal matrix, infinite where it is singular, its rank, and the condition of the
+    Jacobian.
 
     Parameters
     ----------

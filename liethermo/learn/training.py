@@ -161,12 +161,12 @@ class Training(metaclass=ListedType):
     def with_estimates(
         self,
         params: ParameterVector,
-        refined: LeastSquaresResult | None,
+        least_squares_result: LeastSquaresResult | None,
         noise,
         noise_is_estimated: bool,
         shape: tuple[int, int],
     ) -> Training:
-        """Return the record with the results of a least-squares refinement, and the noise.
+        """Return the record with the results of a least-squares refinement and the noise added.
 
         Parameters
         ----------
@@ -175,12 +175,12 @@ class Training(metaclass=ListedType):
         """
         sigma = np.zeros(0) if noise is None else np.asarray(noise)
         record = replace(self, noise=sigma, noise_is_estimated=noise_is_estimated)
-        if refined is None:
+        if least_squares_result is None:
             return record
-        values = np.where(params.is_log, np.exp(refined.weights), refined.weights)
+        values = np.where(params.is_log, np.exp(least_squares_result.weights), least_squares_result.weights)
         scale = np.where(params.is_log, values, 1.0)
         with np.errstate(invalid="ignore"):
-            covariance = refined.covariance * np.outer(scale, scale)
+            covariance = least_squares_result.covariance * np.outer(scale, scale)
         covariance = np.where(np.isfinite(covariance), covariance, np.inf)
         return replace(
             record,
@@ -188,20 +188,20 @@ class Training(metaclass=ListedType):
             values=values,
             standard_errors=np.sqrt(np.diag(covariance)),
             covariance=covariance,
-            rank=refined.rank,
-            condition=refined.condition,
-            residual=refined.residual,
-            held_out=refined.held_out_residual,
-            gradient=refined.gradient_norm,
-            converged=refined.converged,
-            degrees_of_freedom=refined.degrees_of_freedom,
-            initial_states=np.asarray(refined.states)[: shape[0], 0, : shape[1]],
+            rank=least_squares_result.rank,
+            condition=least_squares_result.condition,
+            residual=least_squares_result.residual,
+            held_out=least_squares_result.held_out_residual,
+            gradient=least_squares_result.gradient_norm,
+            converged=least_squares_result.converged,
+            degrees_of_freedom=least_squares_result.degrees_of_freedom,
+            initial_states=np.asarray(least_squares_result.states)[: shape[0], 0, : shape[1]],
             is_positive=tuple(map(bool, params.is_log)),
-            ended=self.ended | {LEAST_SQUARES: f"after {refined.iterations} iterations"},
+            ended=self.ended | {LEAST_SQUARES: f"after {least_squares_result.iterations} iterations"},
         )
 
     def confidence_interval(self, confidence_level: float = 0.95) -> ConfidenceInterval:
-        """Return intervals that contain the true parameters with a given probability each.
+        """Return the confidence interval of each fitted parameter.
 
         They come from Student's distribution for the estimates, or for their logarithms if parameters stay positive. An
         interval is infinite for a parameter that the data do not determine.
@@ -230,7 +230,7 @@ class Training(metaclass=ListedType):
         )
 
     def estimate(self, quantity: Callable[[jax.Array], Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Return a function of the fitted parameters, and its standard error by linear propagation of errors.
+        """Return the value of a function of the fitted parameters, and its standard error by linear error propagation.
 
         Parameters
         ----------
@@ -252,6 +252,7 @@ class Training(metaclass=ListedType):
         return np.asarray(quantity(values)), np.where(needs_unknown, np.inf, np.sqrt(np.maximum(variance, 0.0)))
 
     def _check_has_estimates(self) -> None:
+        """Raise InputError if the fit has no standard errors."""
         if not len(self.names):
             raise InputError(
                 "the fit has no standard errors: it has networks, more than 64 parameters, or shooting=0. Fit few "
@@ -299,7 +300,7 @@ class Training(metaclass=ListedType):
                 held_out_text = "" if np.isnan(held_out_loss) else f", held out {held_out_loss:.2e}"
                 lines.append(
                     f"{name}: loss {self.loss[indices[0]]:.2e} to {last_loss:.2e}{held_out_text}; {ending}"
-                    f"{self._late_decrease_text(indices)}"
+                    f"{self._late_loss_decrease_text(indices)}"
                 )
         if self.noise.size:
             min_noise, max_noise = float(self.noise.min()), float(self.noise.max())
@@ -327,8 +328,8 @@ class Training(metaclass=ListedType):
         ]
         return "\n".join([*lines, *(f"CAUTION: {problem}" for problem in self.problems)])
 
-    def _late_decrease_text(self, indices: np.ndarray) -> str:
-        """Return in words by how much the loss fell in the last fifth of the evaluations of a phase."""
+    def _late_loss_decrease_text(self, indices: np.ndarray) -> str:
+        """Return a clause with the decrease of the loss over the last fifth of a phase, or "" for few evaluations."""
         if len(indices) < 10:
             return ""
         earlier_loss, last_loss = self.loss[indices[-1 - len(indices) // 5]], self.loss[indices[-1]]
@@ -339,26 +340,26 @@ class Training(metaclass=ListedType):
         )
 
 
-def empty_training(n_parameters: int, seconds: float) -> Training:
-    """Return the record of a fit without a descent."""
-    nothing = np.zeros(0)
-    return Training(np.zeros(0, int), np.zeros(0, str), nothing, nothing, n_parameters, seconds)
+def training_without_descent(n_parameters: int, seconds: float) -> Training:
+    """Return an empty record, for a fit by least squares alone."""
+    no_values = np.zeros(0)
+    return Training(np.zeros(0, int), np.zeros(0, str), no_values, no_values, n_parameters, seconds)
 
 
 class TrainingRun:
-    """State of a running fit: everything that determines its next step, so that it can resume from a file."""
+    """State of a running fit: everything that determines the next step, so that the fit can resume from a file."""
 
-    def __init__(self, phases: list[Phase], start: np.ndarray, fit_fingerprint: str):
+    def __init__(self, phases: list[Phase], initial_weights: np.ndarray, fit_fingerprint: str):
         self.phases, self.fit_fingerprint = phases, fit_fingerprint
         self.phase_index = self.block_index = 0
         self.evaluations: list[tuple[int, str, float, float]] = []
         self.gradient_norm = float("nan")
         self.ended: dict[str, str] = {}
-        self.weights = np.asarray(start)
+        self.weights = np.asarray(initial_weights)
         self._start_phase()
 
     def _start_phase(self) -> None:
-        """Start the current phase from the best weights so far."""
+        """Initialise the current phase from the best weights so far."""
         phase = self.phases[self.phase_index]
         self.block_index, self.evaluations_since_best = 0, 0
         self.vector = jnp.concatenate([jnp.asarray(self.weights), jnp.asarray(phase.objective.initial_free)])
@@ -375,11 +376,11 @@ class TrainingRun:
             If the loss is not finite.
         """
         total = sum(phase.steps for phase in self.phases)
-        with Progress((0, total), progress, "step {:.0f}") as bar:
+        with Progress((0, total), progress, "step {:.0f}") as progress_bar:
             while self.phase_index < len(self.phases):
                 phase = self.phases[self.phase_index]
                 try:
-                    ending = self._run_phase(phase, seed, patience, checkpoint, bar)
+                    ending = self._run_phase(phase, seed, patience, checkpoint, progress_bar)
                 except KeyboardInterrupt:
                     self.ended[phase.name] = "interrupted"
                     self.weights = self.best_vector[: len(self.weights)]
@@ -391,9 +392,18 @@ class TrainingRun:
                     self._start_phase()
                 self._save_checkpoint(checkpoint)
 
-    def _run_phase(self, phase: Phase, seed: int, patience: int | None, checkpoint: Path | None, bar: Progress) -> str:
-        length = min(STEPS_PER_EVALUATION, phase.steps)
-        blocks = -(-phase.steps // length)
+    def _run_phase(
+        self, phase: Phase, seed: int, patience: int | None, checkpoint: Path | None, progress_bar: Progress
+    ) -> str:
+        """Run one phase, with an evaluation and a checkpoint after each block of steps; return why it ended.
+
+        Raises
+        ------
+        InputError
+            If the loss is not finite.
+        """
+        steps_per_block = min(STEPS_PER_EVALUATION, phase.steps)
+        n_blocks = -(-phase.steps // steps_per_block)
         descend, evaluate_held_out = _compile_descent_and_evaluation(phase, self.optimiser)
         previous_steps = sum(p.steps for p in self.phases[: self.phase_index])
         if (
@@ -402,17 +412,17 @@ class TrainingRun:
             and np.isfinite(held_out_loss := evaluate_held_out(self.vector))
         ):
             self.best_loss = held_out_loss  # weights that do worse on held-out data than the initial ones are not kept
-        while self.block_index < blocks:
-            random = np.random.default_rng([seed, self.phase_index, self.block_index])
+        while self.block_index < n_blocks:
+            rng = np.random.default_rng([seed, self.phase_index, self.block_index])
             batch = min(phase.batch_size, phase.objective.n_items)
-            batches = np.stack([random.permutation(phase.objective.n_items)[:batch] for _ in range(length)])
+            batches = np.stack([rng.permutation(phase.objective.n_items)[:batch] for _ in range(steps_per_block)])
             self.vector, self.optimiser_state, losses, gradient_norms = descend(
                 self.vector, self.optimiser_state, phase.objective.arrays, batches
             )
             self.gradient_norm = float(gradient_norms[-1])
             self.block_index += 1
             step, loss, new_held_out_loss = (
-                previous_steps + self.block_index * length,
+                previous_steps + self.block_index * steps_per_block,
                 float(jnp.mean(losses)),
                 evaluate_held_out(self.vector),
             )
@@ -430,21 +440,25 @@ class TrainingRun:
             )
             if compared_loss < self.best_loss:
                 self.best_vector, self.best_loss = np.asarray(self.vector), compared_loss
-            bar.update(step)
+            progress_bar.update(step)
             self._save_checkpoint(checkpoint)
             if patience is not None and self.evaluations_since_best >= patience:
-                return f"no better for {patience} looks, after {self.block_index * length} steps"
-        return f"after {self.block_index * length} steps"
+                return f"no better for {patience} looks, after {self.block_index * steps_per_block} steps"
+        return f"after {self.block_index * steps_per_block} steps"
 
     def training_record(self, seconds: float) -> Training:
-        steps, phases, values, held = zip(*self.evaluations, strict=True) if self.evaluations else ((), (), (), ())
-        count = self.weights.size
-        arrays = np.array(steps, dtype=int), np.array(phases, dtype=str), np.array(values), np.array(held)
-        return Training(*arrays, count, seconds, self.ended, gradient=self.gradient_norm)
+        """Return the record of the evaluations so far, for a fit that took some seconds."""
+        steps, phases, losses, held_out_losses = (
+            zip(*self.evaluations, strict=True) if self.evaluations else ((), (), (), ())
+        )
+        n_weights = self.weights.size
+        arrays = np.array(steps, dtype=int), np.array(phases, dtype=str), np.array(losses), np.array(held_out_losses)
+        return Training(*arrays, n_weights, seconds, self.ended, gradient=self.gradient_norm)
 
     # -- files --------------------------------------------------------------------------------------------------------
 
     def _save_checkpoint(self, path: Path | None) -> None:
+        """Save the state of the fit to a file, unless the path is None."""
         if path is None:
             return
         metadata = {
@@ -462,7 +476,7 @@ class TrainingRun:
         arrays = {"weights": self.weights, "vector": self.vector, "best": self.best_vector}
         write_archive(path, metadata, arrays | {f"state_{i}": leaf for i, leaf in enumerate(leaves)})
 
-    def restore(self, path: Path) -> None:
+    def restore_checkpoint(self, path: Path) -> None:
         """Restore the state of the fit from a checkpoint file, without training.
 
         Raises
@@ -497,8 +511,7 @@ class TrainingRun:
 
 
 def _make_optimiser(phase: Phase) -> Any:
-    """Return an optimiser whose rate falls to a hundredth along a cosine; it skips steps with a gradient that is not
-    finite."""
+    """Return the optimiser of a phase: SOAP with a cosine schedule; it skips steps whose gradient is not finite."""
     try:
         import optax
     except ImportError:
@@ -510,7 +523,7 @@ def _make_optimiser(phase: Phase) -> Any:
 
 
 def _compile_descent_and_evaluation(phase: Phase, optimiser: Any) -> tuple[Callable, Callable]:
-    """Return compiled functions that take a block of steps, and that evaluate the held-out loss."""
+    """Return two compiled functions: one takes a block of optimiser steps, one evaluates the held-out loss."""
 
     def train_step(carry, indices):
         vector, state, arrays = carry
@@ -540,7 +553,7 @@ def _compile_descent_and_evaluation(phase: Phase, optimiser: Any) -> tuple[Calla
 
 
 def write_archive(path: Path, metadata: dict[str, Any], arrays: dict[str, Any]) -> None:
-    """Write arrays and JSON metadata to a file, atomically.
+    """Write arrays and JSON metadata to an NPZ file atomically.
 
     Raises
     ------
@@ -553,8 +566,8 @@ def write_archive(path: Path, metadata: dict[str, Any], arrays: dict[str, Any]) 
         disk.write_atomically(path, buffer.getvalue())
 
 
-def read_archive(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Read the metadata and arrays of a file that :func:`write_archive` wrote.
+def read_archive(path: Path, file_format: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Read the JSON metadata and the arrays of an NPZ file that :func:`write_archive` wrote.
 
     Raises
     ------
@@ -568,8 +581,8 @@ def read_archive(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.nd
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         metadata = json.loads(arrays.pop("__json__").tobytes())
-        if not isinstance(metadata, dict) or metadata.get("format") != kind:
-            raise ValueError(f"it is not a {kind}")
+        if not isinstance(metadata, dict) or metadata.get("format") != file_format:
+            raise ValueError(f"it is not a {file_format}")
         if metadata.pop("checksum", None) != _checksum(metadata, arrays):
             raise ValueError("its contents are not those that were written")
     except FileNotFoundError:
@@ -586,9 +599,9 @@ def _checksum(metadata: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:
     return fingerprint(json.dumps(metadata, sort_keys=True), *parts)
 
 
-def fingerprint(*parts: Any) -> str:
+def fingerprint(*values: Any) -> str:
     """Return the SHA-256 of arrays and of the texts of other objects, as hexadecimal."""
     digest = hashlib.sha256()
-    for part in parts:
+    for part in values:
         digest.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
     return digest.hexdigest()

@@ -21,7 +21,6 @@ from manifolds._pytree_module import replace_fields
 from ..integrators import OneStepMethod
 from ..integrators.preserved import casimir_residuals, is_momentum_map, why_not_preserved
 from ..systems import System
-from ..systems.baths import HeatBaths
 from ..systems.conservation import judge_conservation, rates_of_change
 from ..systems.interface import InvariantVerdicts
 from ..systems.invariants import (
@@ -310,7 +309,7 @@ class _MemberFunctions:
         """
         points = np.broadcast_to(points, (len(rows), *points.shape))
         baths = self.member.baths
-        if baths is None or not any(self.family.has_member_axis):
+        if not baths.number or not any(self.family.has_member_axis):
             return points
         parameters = self.family.parameter_matrix(rows, len(rows))
         scales = evaluate_at_points(_bath_entropy_scales, (self.family.form, parameters.shape[1]), parameters)[:, None]
@@ -362,7 +361,6 @@ def _requested_casimir_residuals(model, row):
 def _bath_entropy_scales(model, row):
     form, p = model
     system, _ = _member_and_state(form, p, row)
-    assert isinstance(system.baths, HeatBaths)
     return system.baths.entropy_scales()
 
 

@@ -213,7 +213,7 @@ def steady_cycle(
 def _heat_and_work(system: System, solution: Solution) -> tuple[np.ndarray, float]:
     """Return the heat that flows from each bath into the system over a cycle, and the work that the system receives."""
     work = float(solution.casimirs["work"][-1] - solution.casimirs["work"][0])
-    if system.baths is None:
+    if not system.baths.number:
         return np.zeros(0), work
     if not system.baths.energy.depends_on_time:
         entropies = (solution.x[-1] - solution.x[0])[system.body_dim :]

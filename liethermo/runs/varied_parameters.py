@@ -82,7 +82,7 @@ class VariedParameters:
         self._functions = tuple(
             name for name in named_functions(system) if name not in invariants_by_construction(system)
         )
-        self._bath_scales = 1.0 if system.baths is None else np.asarray(system.baths.scale)
+        self._bath_scales = np.asarray(system.baths.scale)
         self._codes: list[float] = []
         self._test = None
         if self._functions:
@@ -152,7 +152,7 @@ class VariedParameters:
     def _verdict_codes(self, entries, x) -> jax.Array:
         """Return the verdict on each function at the random state x of the first system, shape (functions,)."""
         system = self._system(entries)
-        if system.baths is not None:  # the entropies of baths scale with their capacities
+        if system.baths.number:  # the entropies of baths scale with their capacities
             x = x.at[system.body_dim :].multiply(system.baths.entropy_scales() / self._bath_scales)
         functions = tuple(named_functions(system)[name] for name in self._functions)
         rates = rates_of_change((system, functions), x)

@@ -166,6 +166,15 @@ def sobol(count: int, *, seed: int, **ranges) -> Zipped:
 
 
 def _sample_from_ranges(draw_unit_sample, ranges: Mapping[str, Any]) -> Zipped:
+    """Draw a sample in the unit cube and scale it to the ranges of the parameters.
+
+    ``draw_unit_sample(d)`` returns an array of shape (count, d).
+
+    Raises
+    ------
+    InputError
+        If there is no range, or a range is not (low, high) or (low, high, "log") with finite low < high.
+    """
     if not ranges:
         raise InputError("a sample needs at least one range of a parameter, such as rate=(0.1, 10.0, 'log')")
     for name, bounds in ranges.items():
@@ -186,13 +195,15 @@ def _sample_from_ranges(draw_unit_sample, ranges: Mapping[str, Any]) -> Zipped:
 
 
 def _checked_count(count) -> int:
+    """Return the number of points as an int; raise InputError unless it is a positive integer."""
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
         raise InputError(f"the number of points must be a positive integer, got {count!r}")
     return int(count)
 
 
 def _checked_column(name: str, values) -> np.ndarray:
-    """Return the values as an array of finite numbers or texts, shape (m,), m > 0."""
+    """Return the values of a parameter as an array of shape (m,), m > 0; raise InputError unless they are finite
+    numbers or texts."""
     array = np.asarray(values)
     if array.dtype.kind == "U" and not all(isinstance(value, str) for value in np.asarray(values, dtype=object).flat):
         raise InputError(f"the values of {name!r} must be either numbers or texts, got both")
@@ -228,11 +239,12 @@ class Axis:
     states: np.ndarray | None = None
 
     @classmethod
-    def from_values(cls, name: str, source) -> Axis:
-        """Make an axis from the values that the user gives; a value that occurs twice is refused."""
-        if isinstance(source, Zipped):
-            return cls(name, np.arange(len(source)), source.columns, source.states)
-        values = _checked_column(name, source)
+    def from_values(cls, name: str, values_or_sample) -> Axis:
+        """Return an axis made from a list of values, or from a :class:`Zipped`; raise InputError if a value occurs
+        twice."""
+        if isinstance(values_or_sample, Zipped):
+            return cls(name, np.arange(len(values_or_sample)), values_or_sample.columns, values_or_sample.states)
+        values = _checked_column(name, values_or_sample)
         unique, first_indices = np.unique(values, return_index=True)
         if len(unique) < len(values):
             i = int(np.setdiff1d(np.arange(len(values)), first_indices)[0])
@@ -242,12 +254,16 @@ class Axis:
     def __len__(self) -> int:
         return len(self.labels)
 
-    def has_same_values(self, axis: Axis) -> bool:
-        """Return True if another axis with equal column names has equal labels, columns and states, in order."""
-        pairs = [(self.labels, axis.labels), *((column, axis.columns[n]) for n, column in self.columns.items())]
-        if self.states is not None or axis.states is not None:
-            pairs.append((np.asarray(self.states), np.asarray(axis.states)))
-        return all(np.array_equal(one, another) for one, another in pairs)
+    def has_equal_values(self, other_axis: Axis) -> bool:
+        """Return True if the labels, columns and states of another axis, with equal column names, are equal and in
+        the same order."""
+        pairs = [
+            (self.labels, other_axis.labels),
+            *((column, other_axis.columns[n]) for n, column in self.columns.items()),
+        ]
+        if self.states is not None or other_axis.states is not None:
+            pairs.append((np.asarray(self.states), np.asarray(other_axis.states)))
+        return all(np.array_equal(a, b) for a, b in pairs)
 
     def value_keys(self) -> list[tuple]:
         """Return one hashable key per point of the axis, from its values rounded to 13 digits."""
@@ -279,7 +295,8 @@ class Axes:
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> Axes:
-        """Make the axes from the argument ``axes`` of :class:`Study`, and check it."""
+        """Return the axes of a study from a dict of values by name, the argument ``axes`` of :class:`Study`; raise
+        InputError if a name or a value is invalid."""
         if not isinstance(mapping, Mapping) or not mapping:
             raise InputError(
                 f'axes must be a dict from names to values, such as {{"rate": [0.1, 1.0]}}, got {mapping!r:.60}'
@@ -309,14 +326,15 @@ class Axes:
         return math.prod(self.shape)
 
     def parameters_at(self, indices: tuple[np.ndarray, ...]) -> dict[str, np.ndarray]:
-        """Return the parameters at some points, arrays of shape (n_points,), from the points' indices along each
+        """Return the parameter values, arrays of shape (n_points,) by name, of the points with these indices along each
         axis."""
         return {
             name: column[i] for axis, i in zip(self.axes, indices, strict=True) for name, column in axis.columns.items()
         }
 
     def states_at(self, indices: tuple[np.ndarray, ...]) -> np.ndarray | None:
-        """Return the initial states at some points, shape (n_points, n), or None if no axis has states."""
+        """Return the initial states, shape (n_points, n), of the points with these indices along each axis; None if no
+        axis has states."""
         return next(
             (axis.states[i] for axis, i in zip(self.axes, indices, strict=True) if axis.states is not None), None
         )
@@ -331,7 +349,7 @@ class Axes:
 
 
 def axes_in_store_order(study_axes: Axes, stored_axes: Axes) -> Axes:
-    """Return the study's axes in the order of a store: first the values that it has, then the new ones.
+    """Return the axes of a study with their values reordered: the values that the store has come first, in its order.
 
     Raises
     ------
@@ -341,25 +359,25 @@ def axes_in_store_order(study_axes: Axes, stored_axes: Axes) -> Axes:
     if study_axes.names != stored_axes.names or [tuple(a.columns) for a in study_axes.axes] != [
         tuple(a.columns) for a in stored_axes.axes
     ]:
-        names = [
+        descriptions = [
             ", ".join(f"{a.name} ({', '.join(a.columns)})" for a in axes.axes) for axes in (study_axes, stored_axes)
         ]
-        raise InputError(f"the axes are {names[0]}, but those of the store {names[1]}")
+        raise InputError(f"the axes are {descriptions[0]}, but those of the store {descriptions[1]}")
     matched_axes = []
     for axis, stored_axis in zip(study_axes.axes, stored_axes.axes, strict=True):
-        if axis.has_same_values(stored_axis):  # skip the search, which takes microseconds per value
+        if axis.has_equal_values(stored_axis):  # skip the search, which takes microseconds per value
             matched_axes.append(axis)
             continue
         unmatched_indices: dict[Any, list[int]] = {}
-        for i, row in enumerate(axis.value_keys()):
-            unmatched_indices.setdefault(row, []).append(i)
-        for i, row in enumerate(stored_axis.value_keys()):
-            if not unmatched_indices.get(row):
+        for i, key in enumerate(axis.value_keys()):
+            unmatched_indices.setdefault(key, []).append(i)
+        for i, key in enumerate(stored_axis.value_keys()):
+            if not unmatched_indices.get(key):
                 raise InputError(
-                    f"the axis {axis.name!r} lacks {row[0] if len(row) == 1 else row!r}, which is value {i} in the "
+                    f"the axis {axis.name!r} lacks {key[0] if len(key) == 1 else key!r}, which is value {i} in the "
                     "store; an axis can be extended, but must keep its values"
                 )
-            unmatched_indices[row].pop(0)
+            unmatched_indices[key].pop(0)
         new_indices = sorted(itertools.chain.from_iterable(unmatched_indices.values()))
         columns = {
             name: np.append(stored_values, axis.columns[name][new_indices])

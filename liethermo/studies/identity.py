@@ -24,7 +24,7 @@ N_PROBE_STATES = 3
 
 
 def study_as_json(solver: PointSolver, example_results: PointResults, x0: np.ndarray) -> dict[str, Any]:
-    """Return a description of a study as JSON data.
+    """Return JSON data that describe a study: its arguments, and values of its system and measures at one point.
 
     Parameters
     ----------
@@ -37,12 +37,12 @@ def study_as_json(solver: PointSolver, example_results: PointResults, x0: np.nda
     task, system = solver.task, solver.systems.example_system
     states = np.concatenate([x0[None], system.samples(N_PROBE_STATES, seed=1)])
     with np.errstate(all="ignore"):
-        probe = [_to_json_numbers(_system_at_time(system, task.t_span[0]).vector_field(x)) for x in states]
+        vector_fields = [_to_json_numbers(_system_at_time(system, task.t_span[0]).vector_field(x)) for x in states]
         energies = [_to_json_numbers(system.energy.at_time(task.t_span[0]).value(x)) for x in states]
     return {
         "versions": {name: metadata.version(name) for name in ("liethermo", "jax")},
         "system": f"{type(system).__name__}, {system.dim} components",
-        "motion": probe,
+        "motion": vector_fields,
         "energy": energies,
         "operations": _program_digest(solver),
         "x0": _to_json_numbers(x0),
@@ -56,23 +56,24 @@ def study_as_json(solver: PointSolver, example_results: PointResults, x0: np.nda
     }
 
 
-def provenance(description: Mapping[str, Any], engine: str) -> dict[str, Any]:
-    """Return the settings, versions and engine that produced the results, as attributes of the store."""
-    settings = {key: description[key] for key in ("system", "method", "step", "t_span", "until", "noise")}
+def provenance(study_description: Mapping[str, Any], engine: str) -> dict[str, Any]:
+    """Return the settings, package versions and engine that produced the results, as a dict of store attributes."""
+    settings = {key: study_description[key] for key in ("system", "method", "step", "t_span", "until", "noise")}
     return {
         **settings,
-        **{f"{name}_version": version for name, version in description["versions"].items()},
+        **{f"{name}_version": version for name, version in study_description["versions"].items()},
         "engine": engine,
     }
 
 
-def study_differences(description: Mapping[str, Any], stored_description: Mapping[str, Any]) -> list[str]:
-    """Return the differences between a study and the stored one, one line each; empty if they are equal."""
-    same_versions = description["versions"] == stored_description["versions"]
+def study_differences(study_description: Mapping[str, Any], stored_description: Mapping[str, Any]) -> list[str]:
+    """Return the differences between the descriptions of a study and of a stored study, one line each; none if they
+    are equal."""
+    same_versions = study_description["versions"] == stored_description["versions"]
     differences = [
-        f"{key} is {description[key]!r:.120}, and {stored_description.get(key)!r:.120} in the store"
+        f"{key} is {study_description[key]!r:.120}, and {stored_description.get(key)!r:.120} in the store"
         for key in ("system", "t_span", "step", "method", "until", "noise", "measures")
-        if description[key] != stored_description.get(key)
+        if study_description[key] != stored_description.get(key)
     ]
     if differences:
         return differences
@@ -82,16 +83,16 @@ def study_differences(description: Mapping[str, Any], stored_description: Mappin
         "x0": "the initial state",
     }
     differences += [
-        _value_difference_text(label, description[key], stored_description[key]) for key, label in numbers.items()
+        _value_difference_text(label, study_description[key], stored_description[key]) for key, label in numbers.items()
     ]
-    for name in set(description["values"]) & set(stored_description["values"]):
+    for name in set(study_description["values"]) & set(stored_description["values"]):
         differences.append(
             _value_difference_text(
-                f"the measure {name!r}", description["values"][name], stored_description["values"][name]
+                f"the measure {name!r}", study_description["values"][name], stored_description["values"][name]
             )
         )
     differences = [line for line in differences if line]
-    if not differences and same_versions and description["operations"] != stored_description["operations"]:
+    if not differences and same_versions and study_description["operations"] != stored_description["operations"]:
         differences.append(
             "the system has the same values at some states, and is computed by other operations than in the store: "
             "it differs elsewhere, or in rounding"
@@ -105,9 +106,9 @@ def _system_at_time(system: Any, t: float) -> Any:
     return system.at_time(t, system.group.identity) if system.torque_laws.needs_attitude else system.at_time(t)
 
 
-def _value_difference_text(label: str, numbers: list, stored_values: list) -> str:
-    """Return a line that names the first differing number of two lists, or "" if all agree within ``VALUE_RTOL``."""
-    a, b = (np.asarray(values, dtype=np.float64).ravel() for values in (numbers, stored_values))
+def _value_difference_text(label: str, study_values: list, stored_values: list) -> str:
+    """Return a line with the first number that differs between two lists, or "" if all agree within ``VALUE_RTOL``."""
+    a, b = (np.asarray(values, dtype=np.float64).ravel() for values in (study_values, stored_values))
     if a.shape != b.shape:
         return f"{label} has {a.size} numbers at the first point, and {b.size} in the store"
     scale = max(float(np.nanmax(np.abs(b), initial=0.0)), 1e-300)
@@ -142,17 +143,17 @@ ADDRESS_PATTERN = re.compile(r" at 0x[0-9a-f]+|\bid=\d+")
 
 def _program_digest(solver: PointSolver) -> str:
     """Return the SHA-256 digest of the JAX programs of the system and the event, and of their constants."""
-    task, members = solver.task, solver.systems
-    x = jax.ShapeDtypeStruct((members.example_system.dim,), np.float64)
+    task, study_systems = solver.task, solver.systems
+    x = jax.ShapeDtypeStruct((study_systems.example_system.dim,), np.float64)
 
     def energy_and_vector_field(system, x):
         return system.energy.at_time(task.t_span[0]).value(x), _system_at_time(system, task.t_span[0]).vector_field(x)
 
     jaxprs, constants = [], []
-    if members.family is None or not task.parameter_names:
-        jaxprs.append(jax.make_jaxpr(lambda x: energy_and_vector_field(members.example_system, x))(x))
+    if study_systems.family is None or not task.parameter_names:
+        jaxprs.append(jax.make_jaxpr(lambda x: energy_and_vector_field(study_systems.example_system, x))(x))
     else:
-        family = members.family.with_builder_arrays([np.zeros(2) for _ in task.parameter_names])
+        family = study_systems.family.with_builder_arrays([np.zeros(2) for _ in task.parameter_names])
         shapes = [jax.ShapeDtypeStruct(np.shape(value)[1:], np.float64) for value in family.parameter_arrays]
         jaxprs.append(
             jax.make_jaxpr(lambda arrays, x: energy_and_vector_field(family.form.rebuild(arrays), x))(shapes, x)

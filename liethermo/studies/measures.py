@@ -72,8 +72,9 @@ class Measure(ABC):
         return False
 
     @abstractmethod
-    def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
-        """Return the values of at least the first ``count`` trajectories, and the reasons of failed ones by index."""
+    def __call__(self, ensemble: Ensemble, n_points: int) -> tuple[np.ndarray, dict[int, str]]:
+        """Return the values of the measure for at least the first ``n_points`` trajectories, and an error message for
+        each failed trajectory, by index."""
 
     @abstractmethod
     def description(self) -> str:
@@ -90,7 +91,7 @@ class EnsembleField(Measure):
     def needs_final_state(self) -> bool:
         return self.name in ("final", "final_attitude")
 
-    def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
+    def __call__(self, ensemble: Ensemble, n_points: int) -> tuple[np.ndarray, dict[int, str]]:
         field = {"final": "x"}.get(self.name, self.name.removeprefix("final_"))
         values = getattr(ensemble, field)
         if values is None:
@@ -102,7 +103,7 @@ class EnsembleField(Measure):
 
 
 def _final_values(values: np.ndarray, ensemble: Ensemble) -> np.ndarray:
-    """Return the values at the last saved time of each trajectory."""
+    """Select from the saved values of an ensemble those at the last saved time of each trajectory."""
     if ensemble.energy.ndim == 1:
         return values
     last_index = np.maximum(np.isfinite(ensemble.energy).sum(axis=1) - 1, 0)
@@ -115,7 +116,7 @@ class EventTime(Measure):
 
     event: str
 
-    def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
+    def __call__(self, ensemble: Ensemble, n_points: int) -> tuple[np.ndarray, dict[int, str]]:
         return ensemble.event_time, {}
 
     def description(self) -> str:
@@ -130,7 +131,7 @@ class ValuesAtTimes(Measure):
 
     needs_path = True
 
-    def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
+    def __call__(self, ensemble: Ensemble, n_points: int) -> tuple[np.ndarray, dict[int, str]]:
         values = getattr(ensemble, self.at.what)
         if values is None:
             raise InputError(f"this system has no {self.at.what}")
@@ -158,28 +159,28 @@ class SolutionMeasure(Measure):
 
     needs_path = True
 
-    def __call__(self, ensemble: Ensemble, count: int) -> tuple[np.ndarray, dict[int, str]]:
+    def __call__(self, ensemble: Ensemble, n_points: int) -> tuple[np.ndarray, dict[int, str]]:
         values_by_index: dict[int, np.ndarray] = {}
-        reasons: dict[int, str] = {}
-        example = self.example_value
-        for i in range(count):
+        failure_messages: dict[int, str] = {}
+        example_value = self.example_value
+        for i in range(n_points):
             try:
                 value = np.asarray(self.function(ensemble.member_solution(i)))
                 if value.dtype.kind not in "fiubc":
                     raise TypeError(f"it returned {value.dtype}, not numbers")
-                example = value if example is None else example
-                if value.shape != example.shape or (value.dtype.kind == "c") > (example.dtype.kind == "c"):
+                example_value = value if example_value is None else example_value
+                if value.shape != example_value.shape or (value.dtype.kind == "c") > (example_value.dtype.kind == "c"):
                     raise TypeError(
-                        f"it returned {_describe_array(value)}, but {_describe_array(example)} at the first point"
+                        f"it returned {_describe_array(value)}, but {_describe_array(example_value)} at the first point"
                     )
                 values_by_index[i] = value
             except Exception as error:  # user code; its error becomes the status of this point
-                reasons[i] = f"{self._function_name} raised {type(error).__name__}: {error}"
-        example = np.asarray(np.nan) if example is None else example
-        values = np.full((len(ensemble), *example.shape), np.nan, dtype=np.result_type(np.float64, example))
+                failure_messages[i] = f"{self._function_name} raised {type(error).__name__}: {error}"
+        example_value = np.asarray(np.nan) if example_value is None else example_value
+        values = np.full((len(ensemble), *example_value.shape), np.nan, dtype=np.result_type(np.float64, example_value))
         for i, value in values_by_index.items():
             values[i] = value
-        return values, reasons
+        return values, failure_messages
 
     @property
     def _function_name(self) -> str:
@@ -190,11 +191,12 @@ class SolutionMeasure(Measure):
 
 
 def _describe_array(value: np.ndarray) -> str:
+    """Return the shape of an array, and whether it is real or complex, as text."""
     return f"{'complex' if value.dtype.kind == 'c' else 'real'} numbers of shape {value.shape}"
 
 
 def parse_measures_and_event(specification: Mapping[str, Any], until: Any) -> tuple[dict[str, Measure], Any]:
-    """Return the quantities that a :class:`Study` computes of each run, by name, and the event that ends its runs.
+    """Return the :class:`Measure` objects of a study by name, and the event that ends its runs.
 
     Raises
     ------

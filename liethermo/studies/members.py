@@ -64,8 +64,10 @@ class AccessRecorder(dict):
         return super().values()
 
 
-def system_builder(build: System | Callable[[dict], System], parameters: tuple[str, ...]) -> Callable[[dict], System]:
-    """Return a function from the parameters of a point to its system.
+def system_builder(
+    build: System | Callable[[dict], System], parameter_names: tuple[str, ...]
+) -> Callable[[dict], System]:
+    """Return a function that builds a system from a dict of parameters.
 
     If ``build`` is a system, the function replaces the named parameters in it.
 
@@ -78,34 +80,40 @@ def system_builder(build: System | Callable[[dict], System], parameters: tuple[s
         if not callable(build):
             raise InputError(f"build must be a system, or a function that returns one, got {build!r:.60}")
         return build
-    return functools.partial(_with_entries, build, {name: _parameter_entry(build, name) for name in parameters})
+    return functools.partial(
+        _replace_parameter_entries, build, {name: _parameter_name_and_index(build, name) for name in parameter_names}
+    )
 
 
-def _parameter_entry(system: System, name: str) -> tuple[str, tuple[int, ...]]:
-    """Return the name of a parameter and the index of one entry of it, from a name such as ``energy.inertia[0]``.
+def _parameter_name_and_index(system: System, entry_name: str) -> tuple[str, tuple[int, ...]]:
+    """Split a name such as ``energy.inertia[0]`` into the name of a parameter of the system and the index of an entry.
 
     Raises
     ------
     InputError
         If the system has no such entry.
     """
-    indices = TRAILING_INDICES.search(name)
+    indices = TRAILING_INDICES.search(entry_name)
     assert indices is not None
     index_starts = [indices.start() + match.start() for match in re.finditer(r"\[", indices[0])]
-    for end in (*index_starts, len(name)):  # the name itself may end with an index, such as parts[0]
-        parameter, index = lookup_parameter(system, name[:end]), tuple(map(int, re.findall(r"\d+", name[end:])))
+    for end in (*index_starts, len(entry_name)):  # the name itself may end with an index, such as parts[0]
+        parameter = lookup_parameter(system, entry_name[:end])
+        index = tuple(map(int, re.findall(r"\d+", entry_name[end:])))
         shape = () if parameter is None else parameter.value.shape
         if parameter is not None and len(index) == len(shape) and all(map(int.__lt__, index, shape)):
-            return name[:end], index
+            return entry_name[:end], index
     shapes = {name: value.shape for name, value in named_parameters(system).items()}
     available = ", ".join(name + "".join(f"[0..{m - 1}]" for m in shape) for name, shape in shapes.items())
-    raise InputError(f"the system has no parameter {name!r} that is one number; it has {available}")
+    raise InputError(f"the system has no parameter {entry_name!r} that is one number; it has {available}")
 
 
-def _with_entries(
+def _replace_parameter_entries(
     system: System, entries: Mapping[str, tuple[str, tuple[int, ...]]], point: Mapping[str, Any]
 ) -> System:
-    """Return the system with the entries of its parameters, given by names and indices, that a point has."""
+    """Return the system with entries of its parameters replaced by the values of a point.
+
+    ``entries`` has the parameter name and the index of the entry for each name in ``point``.
+    """
     values: dict[str, Any] = {}
     for axis_name, (name, index) in entries.items():
         value = values[name] if name in values else jnp.asarray(find_parameter(system, name).value)
@@ -114,7 +122,7 @@ def _with_entries(
 
 
 class StudySystems:
-    """Systems at the points of a study.
+    """Builder of the systems at the points of a study: one by one, or as a family.
 
     Parameters
     ----------
@@ -134,89 +142,95 @@ class StudySystems:
         The reason why there is no family.
     """
 
-    def __init__(self, build: Callable[[dict], System], parameters: tuple[str, ...], example: Mapping[str, Any]):
-        self._build, self._parameters = build, parameters
-        self.example_system = self.system_at(example)
+    def __init__(
+        self, build: Callable[[dict], System], parameter_names: tuple[str, ...], example_point: Mapping[str, Any]
+    ):
+        self._build, self._parameters = build, parameter_names
+        self.example_system = self.system_at(example_point)
         self.family: Family | None = None
         self.why_no_family = ""
         try:
-            example_columns = {name: np.full(2, example[name], dtype=np.float64) for name in parameters}
+            example_columns = {name: np.full(2, example_point[name], dtype=np.float64) for name in parameter_names}
             family = (
-                Family.from_function(self._build_system, example_columns)
+                Family.from_function(self._call_builder, example_columns)
                 if example_columns
                 else Family.from_arguments(self.example_system, None)
             )
             if example_columns:
-                self._conditions = _ParameterConditions(self._build_system, parameters)
+                self._conditions = _ParameterConditions(self._call_builder, parameter_names)
                 family = family.trace_builder()
             self.family = replace(family, example=self.example_system)
         except Exception as error:  # any error of a builder that cannot be traced; it is called with numbers instead
             self.why_no_family = f"{type(error).__name__}: {error}".partition("\n")[0]
 
-    def _build_system(self, point: Mapping[str, Any]) -> System:
+    def _call_builder(self, point: Mapping[str, Any]) -> System:
         return self._build(AccessRecorder(point))
 
     def system_at(self, point: Mapping[str, Any]) -> System:
-        """Build the system at a point, with the checks of its constructors."""
-        system = self._build_system(to_python_values(point))
+        """Build and return the system at one point; its constructors check the parameters."""
+        system = self._call_builder(to_python_values(point))
         if not isinstance(system, System):
             raise InputError(f"the builder must return a system, got {type(system).__name__}")
         return system
 
     def inadmissible_points(self, points: PointParameters, n_points: int) -> dict[int, str]:
-        """Return the reason for each point whose parameters violate a condition, by index; needs a family."""
+        """Return an error message, by index, for each point whose parameters violate a condition of the constructors;
+        needs a family."""
         return self._conditions(points, n_points) if self._parameters else {}
 
     def family_at(self, points: PointParameters, indices: np.ndarray) -> Family:
-        """Return the family of the points at ``indices``."""
+        """Return the family of the systems at the points with these indices."""
         assert self.family is not None
         names = sorted(self._parameters)  # the order in which JAX flattens a dict
         return self.family.with_builder_arrays([np.asarray(points[name][indices], dtype=np.float64) for name in names])
 
 
 def to_python_values(point: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the point with NumPy scalars converted to Python numbers and texts."""
+    """Return the parameters of a point with NumPy scalars converted to Python numbers and texts."""
     return {name: value.item() if isinstance(value, np.generic) else value for name, value in point.items()}
 
 
-def evaluate_in_batches(function: Callable, points: PointParameters, n_points: int) -> list[np.ndarray]:
+def evaluate_in_batches(compiled_function: Callable, points: PointParameters, n_points: int) -> list[np.ndarray]:
     """Evaluate a compiled function at all points in batches of ``FIXED_BATCH_SIZE``; return its output arrays."""
     batches = []
     for start in range(0, n_points, FIXED_BATCH_SIZE):
-        rows = np.minimum(np.arange(start, start + FIXED_BATCH_SIZE), n_points - 1)
-        batch = {name: np.asarray(values, dtype=np.float64)[rows] for name, values in points.items()}
-        batches.append([np.asarray(array)[: n_points - start] for array in jax.tree_util.tree_leaves(function(batch))])
+        indices = np.minimum(np.arange(start, start + FIXED_BATCH_SIZE), n_points - 1)
+        batch = {name: np.asarray(values, dtype=np.float64)[indices] for name, values in points.items()}
+        batches.append(
+            [np.asarray(array)[: n_points - start] for array in jax.tree_util.tree_leaves(compiled_function(batch))]
+        )
     return [np.concatenate(columns) for columns in zip(*batches, strict=True)]
 
 
 class _ParameterConditions:
     """The conditions that a builder imposes on its parameters, compiled for many points."""
 
-    def __init__(self, build: Callable, parameters: tuple[str, ...]):
+    def __init__(self, build: Callable, parameter_names: tuple[str, ...]):
         self._messages: list[str] = []
 
         def evaluate_conditions(point):
-            with collect_conditions() as collected:
+            with collect_conditions() as conditions:
                 build(point)
-            self._messages = [condition.message for condition in collected]
-            return [(condition.holds, condition.value) for condition in collected]
+            self._messages = [condition.message for condition in conditions]
+            return [(condition.holds, condition.value) for condition in conditions]
 
-        jax.eval_shape(evaluate_conditions, {name: jax.ShapeDtypeStruct((), np.float64) for name in parameters})
-        self._run_solver = jax.jit(jax.vmap(evaluate_conditions))
+        jax.eval_shape(evaluate_conditions, {name: jax.ShapeDtypeStruct((), np.float64) for name in parameter_names})
+        self._evaluate_batch = jax.jit(jax.vmap(evaluate_conditions))
 
     def __call__(self, points: PointParameters, n_points: int) -> dict[int, str]:
+        """Return the message of the first violated condition, by index, for each point that violates one."""
         if not self._messages:
             return {}
-        reasons: dict[int, str] = {}
-        results = evaluate_in_batches(self._run_solver, points, n_points)
+        messages_by_index: dict[int, str] = {}
+        results = evaluate_in_batches(self._evaluate_batch, points, n_points)
         for k, message in enumerate(self._messages):
             for i in map(int, np.flatnonzero(~results[2 * k])):
-                reasons.setdefault(i, refusal_message(message, results[2 * k + 1][i]))
-        return reasons
+                messages_by_index.setdefault(i, refusal_message(message, results[2 * k + 1][i]))
+        return messages_by_index
 
 
 class PointwiseArrays:
-    """Initial states, or attitudes, at the points of a study.
+    """Function that evaluates the initial states, or the attitudes, at points of a study.
 
     Parameters
     ----------
@@ -228,11 +242,11 @@ class PointwiseArrays:
         A point. If it is empty or contains a text, the function is not traced.
     """
 
-    def __init__(self, source: Any, parameters: tuple[str, ...], label: str, example: Mapping[str, Any]):
-        self.source, self._parameters, self._label = source, parameters, label
+    def __init__(self, source: Any, parameter_names: tuple[str, ...], label: str, example_point: Mapping[str, Any]):
+        self.source, self._parameters, self._label = source, parameter_names, label
         self._evaluate_batch = None
-        if callable(source) and parameters and not any(isinstance(value, str) for value in example.values()):
-            scalar = {name: jax.ShapeDtypeStruct((), np.float64) for name in parameters}
+        if callable(source) and parameter_names and not any(isinstance(value, str) for value in example_point.values()):
+            scalar = {name: jax.ShapeDtypeStruct((), np.float64) for name in parameter_names}
             try:
                 jax.eval_shape(self._evaluate_point, scalar)
                 self._evaluate_batch = jax.jit(jax.vmap(self._evaluate_point))
@@ -243,27 +257,28 @@ class PointwiseArrays:
         return jnp.asarray(self.source(AccessRecorder(point)))
 
     def __call__(self, points: PointParameters, n_points: int) -> tuple[np.ndarray, dict[int, str]]:
-        """Return the arrays at some points, shape (n_points, ...), and the reasons of failed points by index."""
+        """Return the arrays at some points, shape (n_points, ...), and an error message for each failed point, by
+        index."""
         if not callable(self.source):
             return np.broadcast_to(np.asarray(self.source), (n_points, *np.shape(self.source))), {}
         if self._evaluate_batch is not None:
-            (rows,) = evaluate_in_batches(
+            (arrays_of_points,) = evaluate_in_batches(
                 self._evaluate_batch, {name: points[name] for name in self._parameters}, n_points
             )
-            return rows, {}
+            return arrays_of_points, {}
         arrays: list[Any] = []
-        reasons: dict[int, str] = {}
+        failure_messages: dict[int, str] = {}
         for i in range(n_points):
             try:
                 arrays.append(
                     np.asarray(self.source(AccessRecorder(to_python_values({n: v[i] for n, v in points.items()}))))
                 )
             except Exception as error:  # user code; its error becomes the status of this point
-                reasons[i] = f"{self._label} raised {type(error).__name__}: {error}"
+                failure_messages[i] = f"{self._label} raised {type(error).__name__}: {error}"
                 arrays.append(None)
-        example = next((row for row in arrays if row is not None), np.zeros(0))
-        for i, row in enumerate(arrays):
-            if row is not None and row.shape != example.shape:
-                reasons[i] = f"{self._label} has shape {row.shape}, but {example.shape} at other points"
-        rows_or_example = [example if i in reasons else row for i, row in enumerate(arrays)]
-        return np.array(rows_or_example, dtype=np.float64), reasons
+        example = next((array for array in arrays if array is not None), np.zeros(0))
+        for i, array in enumerate(arrays):
+            if array is not None and array.shape != example.shape:
+                failure_messages[i] = f"{self._label} has shape {array.shape}, but {example.shape} at other points"
+        complete_arrays = [example if i in failure_messages else array for i, array in enumerate(arrays)]
+        return np.array(complete_arrays, dtype=np.float64), failure_messages

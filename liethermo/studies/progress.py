@@ -75,7 +75,7 @@ def format_duration(seconds: float) -> str:
 
 
 def seconds_left(n_points: int, n_done: int, run_record: Mapping[str, Any]) -> float | None:
-    """Return the estimated remaining time of a run in seconds, or None if it has finished no point yet."""
+    """Return an estimate of the remaining time of a run in seconds, or None if the run has finished no point yet."""
     n_done_by_run = n_done - int(run_record.get("done", n_done))
     return (time.time() - run_record["started"]) * (n_points - n_done) / n_done_by_run if n_done_by_run > 0 else None
 

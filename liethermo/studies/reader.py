@@ -28,8 +28,9 @@ class CheckedZarrReader(zarr.storage.LocalStore):
         return self
 
     async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
-        """Return the content of a file; raise FileError if it is damaged, or missing although marked as finished."""
+        """Return the content of a file of the store; raise FileError if the file is damaged, or missing from a finished
+        chunk."""
         name, chunk_separator, index = key.partition("/c/")
         if chunk_separator and name in self.study_store.arrays:
-            self.study_store.require_chunk(name, tuple(map(int, index.split("/"))))
+            self.study_store.check_chunk_file(name, tuple(map(int, index.split("/"))))
         return await super().get(key, prototype, byte_range)

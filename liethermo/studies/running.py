@@ -51,19 +51,22 @@ class ChunkTask:
     states: np.ndarray | None
 
     @classmethod
-    def from_chunk(cls, store: StudyStore, axes: Axes, number: int, is_partial: bool) -> ChunkTask:
-        """Make the task of a chunk, given by its number; if it is partial, only of its missing points."""
-        index = store.chunk_index(number)
-        is_missing = store.read_chunk("status", index) == EMPTY_POINT_STATUS if is_partial else None
-        indices = store.point_indices(index, is_missing)
-        return cls(index, is_partial, indices, axes.parameters_at(indices), axes.states_at(indices))
+    def from_chunk(cls, store: StudyStore, axes: Axes, chunk_number: int, is_partial: bool) -> ChunkTask:
+        """Return the task that solves all points of a chunk, or only the missing points if the chunk is partial."""
+        chunk_index = store.chunk_index(chunk_number)
+        is_missing = store.read_chunk("status", chunk_index) == EMPTY_POINT_STATUS if is_partial else None
+        point_indices = store.point_indices(chunk_index, is_missing)
+        return cls(
+            chunk_index, is_partial, point_indices, axes.parameters_at(point_indices), axes.states_at(point_indices)
+        )
 
     def __len__(self) -> int:
         return len(self.point_indices[0])
 
 
 def solve_and_write_chunks(solver: PointSolver, store: StudyStore, tasks: Sequence[ChunkTask]) -> tuple[int, float]:
-    """Solve the points of several chunks together and write each chunk; return the number of points and the seconds."""
+    """Solve the points of several chunks together and write the chunks; return the number of points and the elapsed
+    seconds."""
     start_time = time.perf_counter()
     names = tasks[0].parameters
     points = {name: np.concatenate([task.parameters[name] for task in tasks]) for name in names}
@@ -99,30 +102,40 @@ class _ChunkPortions:
             chunks = list(itertools.islice(self._remaining_chunks, self._n_chunks))
             if not chunks:
                 return
-            yield [ChunkTask.from_chunk(self._store, self._axes, number, is_partial) for number, is_partial in chunks]
+            yield [
+                ChunkTask.from_chunk(self._store, self._axes, chunk_number, is_partial)
+                for chunk_number, is_partial in chunks
+            ]
 
     def adapt_portion_size(self, n_chunks: int, seconds: float) -> None:
-        """Adapt the number of chunks in a portion to the time that some chunks took."""
+        """Set the number of chunks in the next portion from the time that ``n_chunks`` chunks took."""
         target_chunks = int(n_chunks * TARGET_PORTION_SECONDS / max(seconds, 1e-9))
         self._n_chunks = max(1, min(target_chunks, MAX_PORTION_GROWTH * self._n_chunks, self._max_chunks))
 
 
-def run_locally(solver: PointSolver, store: StudyStore, axes: Axes, survey: StoreSurvey, bar: StudyProgressBar) -> None:
-    """Solve the remaining chunks in this process, on all cores."""
+def solve_chunks_locally(
+    solver: PointSolver, store: StudyStore, axes: Axes, survey: StoreSurvey, progress_bar: StudyProgressBar
+) -> None:
+    """Solve the remaining chunks of a study in this process, on all cores, and write them to the store."""
     portions = _ChunkPortions(store, axes, survey)
     for tasks in portions:
         n_points, seconds = solve_and_write_chunks(solver, store, tasks)
         portions.adapt_portion_size(len(tasks), seconds)
-        bar.advance(n_points)
+        progress_bar.advance(n_points)
 
 
 # -- on a cluster -----------------------------------------------------------------------------------------------------
 
 
-def run_on_cluster(
-    task: StudyTask, store: StudyStore, axes: Axes, survey: StoreSurvey, bar: StudyProgressBar, client: Any
+def solve_chunks_on_cluster(
+    study_task: StudyTask,
+    store: StudyStore,
+    axes: Axes,
+    survey: StoreSurvey,
+    progress_bar: StudyProgressBar,
+    client: Any,
 ) -> None:
-    """Solve the remaining chunks on the workers of a cluster, each of which writes its own chunks.
+    """Solve the remaining chunks of a study on the workers of a Dask cluster; each worker writes its chunks itself.
 
     Raises
     ------
@@ -135,25 +148,25 @@ def run_on_cluster(
     from distributed import as_completed
     from distributed.scheduler import KilledWorker
 
-    pickled_task = cloudpickle.dumps(task)
+    pickled_task = cloudpickle.dumps(study_task)
     portions = _ChunkPortions(store, axes, survey)
     task_lists = iter(portions)
-    running = as_completed()
-    chunks: dict[str, int] = {}
+    pending_futures = as_completed()
+    n_chunks_by_future: dict[str, int] = {}
 
     def submit_next_portion() -> bool:
         tasks = next(task_lists, None)
         if tasks is None:
             return False
         future = client.submit(_solve_and_write_on_worker, pickled_task, str(store.root), tasks, pure=False)
-        chunks[future.key] = len(tasks)
-        running.add(future)
+        n_chunks_by_future[future.key] = len(tasks)
+        pending_futures.add(future)
         return True
 
     try:
-        while running.count() < 2 * _n_cluster_threads(client) and submit_next_portion():
+        while pending_futures.count() < 2 * _n_cluster_threads(client) and submit_next_portion():
             pass
-        for future in running:
+        for future in pending_futures:
             try:
                 n_points, seconds = future.result()
             except ImportError as error:
@@ -162,27 +175,29 @@ def run_on_cluster(
                 ) from error
             except KilledWorker as error:
                 raise LiethermoError(
-                    f"several workers died while they solved {chunks[future.key]} chunks, perhaps for lack of memory. "
+                    f"several workers died while they solved {n_chunks_by_future[future.key]} chunks, perhaps for "
+                    "lack of memory. "
                     f"Use smaller chunks (chunk=...). Finished chunks are saved. {error}"
                 ) from error
-            portions.adapt_portion_size(chunks.pop(future.key), seconds)
-            bar.advance(n_points)
-            while running.count() < 2 * _n_cluster_threads(client) and submit_next_portion():
+            portions.adapt_portion_size(n_chunks_by_future.pop(future.key), seconds)
+            progress_bar.advance(n_points)
+            while pending_futures.count() < 2 * _n_cluster_threads(client) and submit_next_portion():
                 pass
     finally:
-        client.cancel(list(running.futures))
+        client.cancel(list(pending_futures.futures))
 
 
 def _n_cluster_threads(client: Any) -> int:
     return max(1, sum(client.nthreads().values()))
 
 
-def _solve_and_write_on_worker(pickled_task: bytes, root: str, tasks: list[ChunkTask]) -> tuple[int, float]:
-    """Solve chunks on a worker, with one thread per ensemble because each thread of the worker runs a task."""
-    if not Path(root).is_dir():
-        raise FileError(f"this worker does not see {root}: the store must be in a folder that all machines share")
+def _solve_and_write_on_worker(pickled_task: bytes, store_root: str, tasks: list[ChunkTask]) -> tuple[int, float]:
+    """Solve and write chunks on a Dask worker, with one thread per ensemble, as every thread of the worker runs a
+    task."""
+    if not Path(store_root).is_dir():
+        raise FileError(f"this worker does not see {store_root}: the store must be in a folder that all machines share")
     token = MAX_THREADS.set(1)
     try:
-        return solve_and_write_chunks(cached_solver(pickled_task), StudyStore.open(Path(root)), tasks)
+        return solve_and_write_chunks(cached_solver(pickled_task), StudyStore.open(Path(store_root)), tasks)
     finally:
         MAX_THREADS.reset(token)

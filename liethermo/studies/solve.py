@@ -111,7 +111,7 @@ class PointResults:
     measures: dict[str, np.ndarray]
 
     def arrays_by_name(self) -> dict[str, Any]:
-        """Return all results by the name of their array in the store."""
+        """Return the result arrays by their names in the store."""
         return {"status": self.status, "message": self.message, "laws": self.laws, **self.measures}
 
 
@@ -156,32 +156,40 @@ class PointSolver:
     def solve(
         self, points: PointParameters, states: np.ndarray | None, n_points: int, seeds: np.ndarray | None = None
     ) -> PointResults:
-        """Solve some points, from initial states and noise seeds if the points have them, and return their results."""
+        """Run the systems at some points and return their results.
+
+        ``states`` are the initial states if an axis has them, and ``seeds`` the noise seeds of the points.
+        """
         self._seeds = seeds
-        reasons: dict[int, str] = (
+        failure_messages: dict[int, str] = (
             {} if self.systems.family is None else self.systems.inadmissible_points(points, n_points)
         )
         x0s, attitudes = states, None
         if self._x0 is not None:
-            x0s, new_reasons = self._x0(points, n_points)
-            reasons = new_reasons | reasons
+            x0s, new_messages = self._x0(points, n_points)
+            failure_messages = new_messages | failure_messages
         if self._attitude is not None:
-            attitudes, new_reasons = self._attitude(points, n_points)
-            reasons = new_reasons | reasons
+            attitudes, new_messages = self._attitude(points, n_points)
+            failure_messages = new_messages | failure_messages
         assert x0s is not None
         for i in map(int, np.flatnonzero(~np.isfinite(x0s.reshape(n_points, -1)).all(axis=1))):
-            reasons.setdefault(i, f"the initial state is not finite: {x0s[i].tolist()}")
-        indices = np.setdiff1d(np.arange(n_points), list(reasons))
-        ensembles = self._solve_ensembles(points, x0s, attitudes, indices, reasons)
-        return self._collect_results(ensembles, reasons, n_points)
+            failure_messages.setdefault(i, f"the initial state is not finite: {x0s[i].tolist()}")
+        indices = np.setdiff1d(np.arange(n_points), list(failure_messages))
+        ensembles = self._solve_ensembles(points, x0s, attitudes, indices, failure_messages)
+        return self._collect_results(ensembles, failure_messages, n_points)
 
     # -- ensembles ------------------------------------------------------------------------------------------------
 
-    def _solve_ensembles(self, points, x0s, attitudes, indices: np.ndarray, reasons: dict[int, str]) -> list:
-        """Return pairs of point indices and their solved ensemble; points that cannot start get a reason."""
+    def _solve_ensembles(self, points, x0s, attitudes, indices: np.ndarray, failure_messages: dict[int, str]) -> list:
+        """Run the points at ``indices`` in ensembles, and return pairs of point indices and ensemble.
+
+        A point that cannot be run gets an entry in ``failure_messages``.
+        """
         ensembles = []
         for start in range(0, len(indices), batch_size := self._points_per_ensemble()):
-            ensembles += self._solve_or_bisect(points, x0s, attitudes, indices[start : start + batch_size], reasons)
+            ensembles += self._solve_or_bisect(
+                points, x0s, attitudes, indices[start : start + batch_size], failure_messages
+            )
         return ensembles
 
     def _points_per_ensemble(self) -> int:
@@ -197,15 +205,16 @@ class PointSolver:
             else max_paths
         )
 
-    def _solve_or_bisect(self, points, x0s, attitudes, indices: np.ndarray, reasons: dict[int, str]) -> list:
-        """Return pairs of point indices and solved ensemble, of ``indices`` together or, if that fails, of halves."""
+    def _solve_or_bisect(self, points, x0s, attitudes, indices: np.ndarray, failure_messages: dict[int, str]) -> list:
+        """Run the points at ``indices`` in one ensemble or, if that fails, each half by itself; return pairs of point
+        indices and ensemble."""
         if not len(indices):
             return []
         try:
             solved_ensemble = self._run_ensemble(points, x0s, attitudes, indices)
         except Exception as error:  # becomes the status of the point when it is alone in the batch
             if len(indices) == 1:
-                reasons[int(indices[0])] = describe_error(error)
+                failure_messages[int(indices[0])] = describe_error(error)
                 return []
         else:
             start_failures = solved_ensemble[
@@ -213,48 +222,52 @@ class PointSolver:
             ].reasons  # solve the other points without these, as results must not depend on the batch
             if not start_failures:
                 return [(indices, solved_ensemble)]
-            reasons |= {int(indices[i]): reason for i, reason in start_failures.items() if i < len(indices)}
-            return self._solve_or_bisect(points, x0s, attitudes, np.setdiff1d(indices, list(reasons)), reasons)
-        middle = len(indices) // 2
-        halves = indices[:middle], indices[middle:]
-        return [part for half in halves for part in self._solve_or_bisect(points, x0s, attitudes, half, reasons)]
+            failure_messages |= {int(indices[i]): reason for i, reason in start_failures.items() if i < len(indices)}
+            return self._solve_or_bisect(
+                points, x0s, attitudes, np.setdiff1d(indices, list(failure_messages)), failure_messages
+            )
+        n_half = len(indices) // 2
+        halves = indices[:n_half], indices[n_half:]
+        return [
+            part for half in halves for part in self._solve_or_bisect(points, x0s, attitudes, half, failure_messages)
+        ]
 
     def _run_ensemble(self, points, x0s, attitudes, indices: np.ndarray) -> tuple[Any, np.ndarray, Ensemble]:
-        """Return the systems, initial states and ensemble of some points.
+        """Run the points at ``indices`` as one ensemble; return their systems, initial states and the ensemble.
 
         For the array engine the batch is padded with the last point to a constant length, so that the compiled program
         does not depend on their number.
         """
         task = self.task
         if self.systems.family is None:
-            rows = indices
-            family: Any = self.systems.system_at({name: values[rows[0]] for name, values in points.items()})
+            padded_indices = indices
+            family: Any = self.systems.system_at({name: values[padded_indices[0]] for name, values in points.items()})
         else:
             batch_size = self._points_per_ensemble() if self.engine == "array" else max(2, len(indices))
-            rows = indices[np.minimum(np.arange(batch_size), len(indices) - 1)]
-            family = self.systems.family_at(points, rows)
-        attitude = None if attitudes is None else attitudes[rows]
+            padded_indices = indices[np.minimum(np.arange(batch_size), len(indices) - 1)]
+            family = self.systems.family_at(points, padded_indices)
+        attitude = None if attitudes is None else attitudes[padded_indices]
         noise = None
         if task.noise is not None and self._seeds is not None:
-            seeds = FILLER_SEED_START + np.arange(len(rows))  # distinct seeds for the padding
+            seeds = FILLER_SEED_START + np.arange(len(padded_indices))  # distinct seeds for the padding
             seeds[: len(indices)] = self._seeds[indices]
-            noise = replace(task.noise, seed=tuple(map(int, seeds[: len(rows)])))
+            noise = replace(task.noise, seed=tuple(map(int, seeds[: len(padded_indices)])))
         options: dict[str, Any] = {"until": task.until, "save_at": task.save_at, "attitude": attitude, "noise": noise}
         result = ensemble(
-            family, x0s[rows], task.t_span, task.step, task.method, progress=False,
+            family, x0s[padded_indices], task.t_span, task.step, task.method, progress=False,
             outputs=self._outputs, engine=self.engine, **{k: v for k, v in options.items() if v is not None},
         )  # fmt: skip
         if (result.status == StatusCode.INTERRUPTED).any():
             raise KeyboardInterrupt
-        return family, x0s[rows], result
+        return family, x0s[padded_indices], result
 
     # -- results ----------------------------------------------------------------------------------------------------
 
-    def _collect_results(self, ensembles: list, reasons: dict[int, str], n_points: int) -> PointResults:
+    def _collect_results(self, ensembles: list, failure_messages: dict[int, str], n_points: int) -> PointResults:
         """Evaluate the laws and measures of all ensembles, and return the results of all points."""
         status = np.full(n_points, StatusCode.INADMISSIBLE, dtype=np.int8)
         message = np.full(n_points, "", dtype=object)
-        message[list(reasons)] = list(reasons.values())
+        message[list(failure_messages)] = list(failure_messages.values())
         laws = np.full((n_points, len(LAW_QUANTITIES)), np.nan)
         measures: dict[str, np.ndarray] = {}
         for indices, (family, x0s, result) in ensembles:
@@ -263,7 +276,9 @@ class PointSolver:
             summary, codes, texts = self._law_values_codes_and_messages(family, x0s, result)
             for name, measure in self.task.measures.items():
                 values, failures = measure(result, count)
-                values = np.where(_align_axes(np.isin(codes, (*SUCCESS_CODES, LAW_BROKEN)), values), values, np.nan)
+                values = np.where(
+                    _expand_mask_dims(np.isin(codes, (*SUCCESS_CODES, LAW_BROKEN)), values), values, np.nan
+                )
                 for i, reason in failures.items():
                     if codes[i] in SUCCESS_CODES:
                         codes[i], texts[i] = MEASURE_FAILED, f"{name}: {reason}"
@@ -277,28 +292,32 @@ class PointSolver:
         return PointResults(status, message, laws, measures)
 
     def _law_values_codes_and_messages(
-        self, family: Any, x0s: np.ndarray, result: Ensemble
+        self, family: Any, x0s: np.ndarray, ensemble_result: Ensemble
     ) -> tuple[np.ndarray, np.ndarray, dict[int, str]]:
         """Return the law quantities of each trajectory, its status code, and its message by index."""
         names = [name for name in LAW_QUANTITIES if not name.endswith("_terms")]
-        columns = {name: np.asarray(getattr(result, name), dtype=np.float64) for name in names}
-        columns |= {"energy_terms": np.zeros(len(result)), "entropy_terms": np.zeros(len(result))}
-        codes = result.status.astype(np.int8)
-        texts = {int(i): result.message(int(i)).partition(": ")[2] for i in np.flatnonzero(~result.ok)}
-        violations = self._broken_laws(result, columns)
+        columns = {name: np.asarray(getattr(ensemble_result, name), dtype=np.float64) for name in names}
+        columns |= {"energy_terms": np.zeros(len(ensemble_result)), "entropy_terms": np.zeros(len(ensemble_result))}
+        codes = ensemble_result.status.astype(np.int8)
+        messages = {
+            int(i): ensemble_result.message(int(i)).partition(": ")[2] for i in np.flatnonzero(~ensemble_result.ok)
+        }
+        violations = self._law_violation_messages(ensemble_result, columns)
         if len(violations):  # cancelling terms raise the tolerance, so their magnitudes are computed for the violations
             for name, terms in self._rounding_scales_at_start(family, x0s, violations).items():
                 columns[f"{name}_terms"][list(violations)] = terms
-            for i, text in self._broken_laws(result, columns).items():
-                codes[i], texts[i] = LAW_BROKEN, text
-        return np.stack([columns[name] for name in LAW_QUANTITIES], axis=-1), codes, texts
+            for i, text in self._law_violation_messages(ensemble_result, columns).items():
+                codes[i], messages[i] = LAW_BROKEN, text
+        return np.stack([columns[name] for name in LAW_QUANTITIES], axis=-1), codes, messages
 
-    def _broken_laws(self, result: Ensemble, law_values: Mapping[str, np.ndarray]) -> dict[int, str]:
-        """Return a message for each successful trajectory that violates a law, by index."""
+    def _law_violation_messages(
+        self, ensemble_result: Ensemble, law_values: Mapping[str, np.ndarray]
+    ) -> dict[int, str]:
+        """Return a message, by index, for each successful trajectory that violates a law."""
         terms = {name: law_values[f"{name}_terms"] for name in ("energy", "entropy")}
         violations: dict[int, str] = {}
-        for check in check_laws(result, result.laws, Tolerances(), terms, has_entropy=False):
-            for i in map(int, np.flatnonzero(check.is_violated & result.ok)):
+        for check in check_laws(ensemble_result, ensemble_result.laws, Tolerances(), terms, has_entropy=False):
+            for i in map(int, np.flatnonzero(check.is_violated & ensemble_result.ok)):
                 row = check.audit_row(i)
                 violations.setdefault(i, f"{row.law} {row.value:.3g}, allowed {row.tolerance:.2g}")
         return violations
@@ -320,8 +339,8 @@ class PointSolver:
         }
 
 
-def _align_axes(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Append axes of length 1 to the mask, so that it broadcasts against the values."""
+def _expand_mask_dims(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the mask with appended axes of length 1, so that it broadcasts against the values."""
     return mask.reshape(-1, *[1] * (values.ndim - 1))
 
 

@@ -62,7 +62,7 @@ class StoreSurvey:
 
 @dataclass(frozen=True)
 class StudyStore:
-    """A store, with the operations that read and write its chunks.
+    """The store of a study on disk, with the operations that read and write its chunks.
 
     Attributes
     ----------
@@ -81,17 +81,17 @@ class StudyStore:
         cls,
         root: Path,
         axes: Axes,
-        chunk: int,
+        points_per_chunk: int,
         measures: Mapping[str, tuple[tuple[int, ...], str]],
         array_attributes: Mapping[str, Mapping[str, Any]],
         attributes: dict[str, Any],
     ) -> StudyStore:
-        """Create a store atomically: it appears complete or not at all.
+        """Create and return a store atomically: its folder appears complete or not at all.
 
         Parameters
         ----------
         axes : Axes
-        chunk : int
+        points_per_chunk : int
             Approximate number of points of a chunk.
         measures : dict from str to (shape, dtype)
             Shape and type of each measure at one point.
@@ -100,11 +100,12 @@ class StudyStore:
         attributes : dict
             Attributes of the group.
         """
-        chunks = _chunk_shape(axes.shape, chunk)
-        arrays = point_arrays(axes.names, axes.shape, chunks, measures, array_attributes)
+        chunk_shape = _chunk_shape(axes.shape, points_per_chunk)
+        arrays = point_arrays(axes.names, axes.shape, chunk_shape, measures, array_attributes)
         if (n_chunks := math.prod(arrays["status"].chunk_grid)) > MAX_CHUNKS:
             raise InputError(
-                f"{axes.size} points in chunks of {chunk} need {n_chunks} files, which are too many. Use a larger chunk"
+                f"{axes.size} points in chunks of {points_per_chunk} need {n_chunks} files, which are too many. "
+                "Use a larger chunk"
             )
         arrays |= {array.name: array for array, _ in coordinate_arrays(axes, array_attributes)}
         store = cls(root, arrays, attributes)
@@ -124,7 +125,7 @@ class StudyStore:
 
     @classmethod
     def open(cls, root: Path) -> StudyStore:
-        """Open a store.
+        """Open the store in a folder and return it.
 
         Raises
         ------
@@ -152,7 +153,7 @@ class StudyStore:
         return self.attributes["study"]
 
     def extend(self, axes: Axes) -> StudyStore:
-        """Write metadata for longer axes, which begin with the present values, and return the extended store."""
+        """Extend the store to longer axes, which begin with the stored values; write its metadata and return it."""
         arrays = dict(self.arrays)
         for name in self.chunked_array_names:
             arrays[name] = replace(arrays[name], shape=axes.shape + arrays[name].shape[len(axes.shape) :])
@@ -162,8 +163,8 @@ class StudyStore:
         store._write_metadata(axes)
         return store
 
-    def repair_axes(self, axes: Axes) -> Axes:
-        """Return the axes of the store, after writing lost or damaged coordinate files again from ``axes``.
+    def read_or_repair_axes(self, axes: Axes) -> Axes:
+        """Return the axes of the store; if coordinate files are lost or damaged, write them again from ``axes``.
 
         Raises
         ------
@@ -182,15 +183,16 @@ class StudyStore:
         return self.read_axes()
 
     def _write_metadata(self, axes: Axes) -> None:
-        """Write the coordinates, then the metadata of the arrays, and finally the group's, which readers open first."""
+        """Write the coordinate files, then the metadata of the arrays, and finally the group metadata, which readers
+        open first."""
         self.attributes["coordinates"] = _coordinates_checksum(axes)
         coordinates = {array.name: values for array, values in coordinate_arrays(axes, {})}
         for name, values in {"quantity": np.array(LAW_QUANTITIES), **coordinates}.items():
             array = self.arrays[name]
             for index in np.ndindex(*array.chunk_grid):
                 slices, block = array.chunk_slices(index), array.empty_chunk()
-                block[_local_slices(slices)] = values[slices]
-                self._write_block(name, index, block)
+                block[_slices_within_chunk(slices)] = values[slices]
+                self._write_padded_chunk(name, index, block)
         metadata = {name: array.metadata() for name, array in self.arrays.items()}
         group = {
             "zarr_format": 3,
@@ -203,7 +205,7 @@ class StudyStore:
             store_metadata.write_file(self.root / path, json.dumps(content, indent=1, allow_nan=False).encode())
 
     def read_axes(self) -> Axes:
-        """Return the axes of the store with their values."""
+        """Read and return the axes of the store with their values."""
         axes = []
         for name, columns in self.attributes["axes"].items():
             state_array = f"{name}_state"
@@ -212,13 +214,13 @@ class StudyStore:
             axes.append(Axis(name, self._read_array(name), column_values, states))
         return Axes(tuple(axes))
 
-    def _read_array(self, name: str) -> np.ndarray:
-        """Return a whole array of the store, none of whose chunks may be missing."""
-        array = self.arrays[name]
+    def _read_array(self, array_name: str) -> np.ndarray:
+        """Return an array of the store, of all its chunks; raise FileError if one is missing or damaged."""
+        array = self.arrays[array_name]
         values = np.empty(array.shape, dtype=array.numpy_dtype)
         for index in np.ndindex(*array.chunk_grid):
             slices = array.chunk_slices(index)
-            values[slices] = self.require_block(name, index)[_local_slices(slices)]
+            values[slices] = self.read_required_chunk(array_name, index)[_slices_within_chunk(slices)]
         return values.astype(str) if array.dtype == "string" else values
 
     # -- chunks of points -------------------------------------------------------------------------------------------
@@ -237,13 +239,13 @@ class StudyStore:
     def n_points(self) -> int:
         return math.prod(self.shape)
 
-    def chunk_index(self, number: int) -> tuple[int, ...]:
-        """Return the index of a chunk along each axis from its number."""
-        return tuple(map(int, np.unravel_index(number, self.arrays["status"].chunk_grid)))
+    def chunk_index(self, chunk_number: int) -> tuple[int, ...]:
+        """Return the index of a chunk along each axis of the chunk grid, from the number of the chunk."""
+        return tuple(map(int, np.unravel_index(chunk_number, self.arrays["status"].chunk_grid)))
 
-    def point_indices(self, index: Sequence[int], mask: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
-        """Return the indices along each axis of the points of a chunk, restricted to ``mask`` if that is given."""
-        slices = self.arrays["status"].chunk_slices(index)
+    def point_indices(self, chunk_index: Sequence[int], mask: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
+        """Return the indices, along each axis of the study, of the points of a chunk, or of those in ``mask``."""
+        slices = self.arrays["status"].chunk_slices(chunk_index)
         local_indices = np.indices([s.stop - s.start for s in slices]).reshape(len(slices), -1)
         if mask is not None:
             local_indices = local_indices[:, mask.ravel()]
@@ -260,30 +262,31 @@ class StudyStore:
         slices = self.arrays["status"].chunk_slices(chunk_index)
         local_indices = tuple(indices - s.start for indices, s in zip(point_indices, slices, strict=True))
         for name in self.chunked_array_names:
-            block = self.read_block(name, chunk_index) if is_partial else None
+            block = self.read_padded_chunk(name, chunk_index) if is_partial else None
             block = self.arrays[name].empty_chunk() if block is None else block
             if name in arrays:  # a measure has no values where no point could be run
                 block[local_indices] = arrays[name]
             if name != "message" or (block != "").any():
-                self._write_block(name, chunk_index, block)
+                self._write_padded_chunk(name, chunk_index, block)
             else:  # a chunk without messages has no file of them
-                (self.root / self._key(name, chunk_index)).unlink(missing_ok=True)
+                (self.root / self._chunk_key(name, chunk_index)).unlink(missing_ok=True)
 
-    def read_chunk(self, name: str, index: Sequence[int]) -> np.ndarray:
-        """Return the values of an array in a chunk; fill values if its file is missing."""
-        block = self.read_block(name, index)
-        slices = _local_slices(self.arrays["status"].chunk_slices(index))
-        return (self.arrays[name].empty_chunk() if block is None else block)[slices]
+    def read_chunk(self, array_name: str, chunk_index: Sequence[int]) -> np.ndarray:
+        """Return the values of an array in a chunk, without the padding of the chunk; fill values if its file is
+        missing."""
+        block = self.read_padded_chunk(array_name, chunk_index)
+        slices = _slices_within_chunk(self.arrays["status"].chunk_slices(chunk_index))
+        return (self.arrays[array_name].empty_chunk() if block is None else block)[slices]
 
-    def read_block(self, name: str, index: Sequence[int]) -> np.ndarray | None:
-        """Return the values of a chunk, shape ``chunks``, or None if it has no file; raise FileError if it is
-        damaged."""
-        path = self.root / self._key(name, index)
+    def read_padded_chunk(self, array_name: str, chunk_index: Sequence[int]) -> np.ndarray | None:
+        """Return the values of an array in a chunk, padded to the chunk shape, or None if the chunk has no file; raise
+        FileError if the file is damaged."""
+        path = self.root / self._chunk_key(array_name, chunk_index)
         if not os.path.lexists(path):
             return None
         try:
-            block = self.arrays[name].decode_chunk(store_metadata.read_plain_file(path))
-            if name == "status" and not np.isin(block, (*STATUSES.values(), EMPTY_POINT_STATUS)).all():
+            block = self.arrays[array_name].decode_chunk(store_metadata.read_plain_file(path))
+            if array_name == "status" and not np.isin(block, (*STATUSES.values(), EMPTY_POINT_STATUS)).all():
                 raise ValueError("it has a status that there is not")
             return block
         except FileError as error:
@@ -291,49 +294,60 @@ class StudyStore:
         except (ValueError, struct.error) as error:
             raise FileError(f"{path} is damaged: {error}. {RERUN_ADVICE}") from error
 
-    def require_block(self, name: str, index: Sequence[int]) -> np.ndarray:
-        """Return the values of a chunk; raise FileError if it is damaged or missing."""
-        block = self.read_block(name, index)
+    def read_required_chunk(self, array_name: str, chunk_index: Sequence[int]) -> np.ndarray:
+        """Return the values of an array in a chunk, padded to the chunk shape; raise FileError if its file is damaged
+        or missing."""
+        block = self.read_padded_chunk(array_name, chunk_index)
         if block is None:
-            raise FileError(f"{self.root / self._key(name, index)} is missing. {RERUN_ADVICE}")
+            raise FileError(f"{self.root / self._chunk_key(array_name, chunk_index)} is missing. {RERUN_ADVICE}")
         return block
 
-    def require_chunk(self, name: str, index: Sequence[int]) -> None:
-        """Raise FileError if a chunk is damaged, or missing although its points are marked as finished."""
-        is_of_points = name in self.chunked_array_names
-        can_be_missing = name in ("message", "status") or self.read_block("status", index[: len(self.shape)]) is None
-        (self.read_block if is_of_points and can_be_missing else self.require_block)(name, index)
+    def check_chunk_file(self, array_name: str, chunk_index: Sequence[int]) -> None:
+        """Raise FileError if the file of a chunk is damaged, or missing although the points of the chunk are
+        finished."""
+        is_of_points = array_name in self.chunked_array_names
+        can_be_missing = (
+            array_name in ("message", "status")
+            or self.read_padded_chunk("status", chunk_index[: len(self.shape)]) is None
+        )
+        (self.read_padded_chunk if is_of_points and can_be_missing else self.read_required_chunk)(
+            array_name, chunk_index
+        )
 
-    def _key(self, name: str, index: Sequence[int]) -> str:
-        """Return the path of a chunk in the store; an array with more dimensions than axes has one chunk along
-        them."""
-        padding = [0] * (len(self.arrays[name].dims) - len(index))
-        return "/".join([name, "c", *map(str, index), *map(str, padding)])
+    def _chunk_key(self, array_name: str, chunk_index: Sequence[int]) -> str:
+        """Return the path of a chunk's file inside the store, with index 0 along the dimensions that are no axes of the
+        study."""
+        padding = [0] * (len(self.arrays[array_name].dims) - len(chunk_index))
+        return "/".join([array_name, "c", *map(str, chunk_index), *map(str, padding)])
 
-    def _write_block(self, name: str, index: Sequence[int], block: np.ndarray) -> None:
-        store_metadata.write_file(self.root / self._key(name, index), self.arrays[name].encode_chunk(block))
+    def _write_padded_chunk(self, array_name: str, chunk_index: Sequence[int], block: np.ndarray) -> None:
+        store_metadata.write_file(
+            self.root / self._chunk_key(array_name, chunk_index), self.arrays[array_name].encode_chunk(block)
+        )
 
     # -- survey -------------------------------------------------------------------------------------------------------
 
     def chunk_statuses(self) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield the number of each chunk and the status of its points, empty where that file is missing or damaged."""
+        """Yield the number of each chunk and the status codes of its points; points without a readable file count as
+        unfinished."""
         for number in range(math.prod(self.arrays["status"].chunk_grid)):
             index = self.chunk_index(number)
             try:
                 yield number, self.read_chunk("status", index)
             except FileError:
-                slices = _local_slices(self.arrays["status"].chunk_slices(index))
+                slices = _slices_within_chunk(self.arrays["status"].chunk_slices(index))
                 yield number, self.arrays["status"].empty_chunk()[slices]
 
     def survey(self) -> StoreSurvey:
-        """Check every file, and return the unfinished chunks, the number of finished points and the damaged files."""
+        """Check every file of the store; return the unfinished chunks, the number of finished points and the damaged
+        files."""
         remaining_chunks: list[tuple[int, bool]] = []
         damaged_files: list[str] = []
         n_done = 0
         for number, status in self.chunk_statuses():
             index = self.chunk_index(number)
-            is_begun = os.path.lexists(self.root / self._key("status", index))
-            faults = self._file_fault_texts(index, status) if is_begun else []
+            is_begun = os.path.lexists(self.root / self._chunk_key("status", index))
+            faults = self._chunk_file_faults(index, status) if is_begun else []
             is_missing = status == EMPTY_POINT_STATUS
             damaged_files += faults
             if faults or is_missing.any():
@@ -341,16 +355,16 @@ class StudyStore:
             n_done += 0 if faults else int((~is_missing).sum())
         return StoreSurvey(remaining_chunks, n_done, tuple(damaged_files))
 
-    def _file_fault_texts(self, index: Sequence[int], status: np.ndarray) -> list[str]:
-        """Return a line for each file of a finished chunk that is missing or damaged."""
+    def _chunk_file_faults(self, chunk_index: Sequence[int], status: np.ndarray) -> list[str]:
+        """Return a message for each file of a finished chunk that is missing or damaged."""
         has_no_messages = np.isin(status, (*SUCCESS_CODES, EMPTY_POINT_STATUS)).all()
         faults = []
         for name in self.chunked_array_names:
             try:
-                if self.read_block(name, index) is None and not (name == "message" and has_no_messages):
-                    faults.append(f"{self._key(name, index)} is missing")
+                if self.read_padded_chunk(name, chunk_index) is None and not (name == "message" and has_no_messages):
+                    faults.append(f"{self._chunk_key(name, chunk_index)} is missing")
             except FileError:
-                faults.append(f"{self._key(name, index)} is damaged")
+                faults.append(f"{self._chunk_key(name, chunk_index)} is damaged")
         return faults
 
     def status_counts(self) -> dict[str, int]:
@@ -363,23 +377,24 @@ class StudyStore:
         return dict(counts)
 
 
-def _local_slices(slices: Sequence[slice]) -> tuple[slice, ...]:
-    """Return the part of a chunk that is inside the array, from the part of the array that the chunk has."""
-    return tuple(slice(0, s.stop - s.start) for s in slices)
+def _slices_within_chunk(array_slices: Sequence[slice]) -> tuple[slice, ...]:
+    """Return the slices of a padded chunk that hold values, from the slices of the array that the chunk covers."""
+    return tuple(slice(0, s.stop - s.start) for s in array_slices)
 
 
 def _coordinates_checksum(axes: Axes) -> str:
-    """Return the SHA-256 digest of the coordinates, in order."""
+    """Return the SHA-256 digest of the coordinates of all axes, in order."""
     digest = hashlib.sha256()
     for array, values in coordinate_arrays(axes, {}):
         digest.update(json.dumps([array.name, values.shape, values.tolist()]).encode())
     return digest.hexdigest()
 
 
-def _chunk_shape(shape: tuple[int, ...], n_points: int) -> tuple[int, ...]:
-    """Return the shape of a chunk of about ``n_points`` points, filled along the last axes first."""
+def _chunk_shape(grid_shape: tuple[int, ...], points_per_chunk: int) -> tuple[int, ...]:
+    """Return the shape of a chunk of about ``points_per_chunk`` points of a grid, as long as possible along the last
+    axes."""
     reversed_shape: list[int] = []
-    for length in reversed(shape):
-        reversed_shape.append(max(1, min(length, n_points)))
-        n_points //= reversed_shape[-1]
+    for length in reversed(grid_shape):
+        reversed_shape.append(max(1, min(length, points_per_chunk)))
+        points_per_chunk //= reversed_shape[-1]
     return tuple(reversed(reversed_shape))

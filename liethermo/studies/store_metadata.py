@@ -95,8 +95,8 @@ class ZarrArray:
 
     @classmethod
     def from_metadata(cls, name: str, metadata: dict[str, Any]) -> ZarrArray:
-        """Make an array from its metadata; raise ValueError, KeyError or TypeError if no study can have written
-        them."""
+        """Return an array description read from Zarr metadata; raise ValueError, KeyError or TypeError if no study can
+        have written the metadata."""
         chunks, attributes = metadata["chunk_grid"]["configuration"]["chunk_shape"], metadata["attributes"]
         dims, shape, dtype = metadata["dimension_names"], metadata["shape"], metadata["data_type"]
         array = cls(name, tuple(dims), tuple(shape), tuple(chunks), dtype, attributes)
@@ -117,7 +117,7 @@ class ZarrArray:
         return tuple(-(-m // c) for m, c in zip(self.shape, self.chunks, strict=True))
 
     def chunk_slices(self, index: Sequence[int]) -> tuple[slice, ...]:
-        """Return the part of the array, or of its first dimensions, that a chunk has."""
+        """Return the slices of the array, along its first ``len(index)`` dimensions, that a chunk covers."""
         return tuple(slice(i * c, min((i + 1) * c, m)) for i, c, m in zip(index, self.chunks, self.shape, strict=False))
 
     def empty_chunk(self) -> np.ndarray:
@@ -126,7 +126,7 @@ class ZarrArray:
         return np.full(self.chunks, fill_value, dtype=self.numpy_dtype)
 
     def encode_chunk(self, block: np.ndarray) -> bytes:
-        """Return the bytes of a chunk's file: the encoded values and a CRC-32C checksum."""
+        """Return the content of a chunk's file: the encoded values and their CRC-32C checksum."""
         if self.dtype == "string":
             texts = [str(value).encode() for value in block.ravel()]
             data = b"".join([struct.pack("<I", len(texts)), *(struct.pack("<I", len(text)) + text for text in texts)])
@@ -135,8 +135,8 @@ class ZarrArray:
         return data + struct.pack("<I", _crc32c(data))
 
     def decode_chunk(self, data: bytes) -> np.ndarray:
-        """Return the values of a chunk from the bytes of its file; raise ValueError or ``struct.error`` if they are
-        damaged."""
+        """Return the values of a chunk, decoded from the content of its file; raise ValueError or ``struct.error`` if
+        the content is damaged."""
         content, size = data[:-4], math.prod(self.chunks)
         if len(data) < 4 or struct.pack("<I", _crc32c(content)) != data[-4:]:
             raise ValueError("it does not have its checksum")
@@ -168,7 +168,11 @@ def point_arrays(
     measures: Mapping[str, tuple[tuple[int, ...], str]],
     array_attributes: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, ZarrArray]:
-    """Return the arrays with a value at each point, of a shape and type for each measure, and the law quantities."""
+    """Return descriptions, by name, of the arrays with a value at each point: status, message, laws and measures; and
+    of the coordinate ``quantity``.
+
+    ``measures`` has the shape and data type of each measure at one point.
+    """
     n_quantities = len(LAW_QUANTITIES)
     trailing: dict[str, tuple[tuple[str, ...], tuple[int, ...], str]]
     trailing = {"status": ((), (), "int8"), "message": ((), (), "string")}
@@ -186,7 +190,7 @@ def point_arrays(
 def coordinate_arrays(
     axes: Axes, array_attributes: Mapping[str, Mapping[str, Any]]
 ) -> Iterator[tuple[ZarrArray, np.ndarray]]:
-    """Yield the coordinate arrays of the axes, with their values."""
+    """Yield, for each coordinate of the axes, the description of its array and its values."""
     for axis in axes.axes:
         coordinates = {axis.name: axis.labels, **axis.columns}
         if axis.states is not None:
@@ -199,7 +203,7 @@ def coordinate_arrays(
 
 
 def with_checksum(group_metadata: dict[str, Any]) -> dict[str, Any]:
-    """Return the metadata of a group with their digest among the attributes."""
+    """Return the metadata of a Zarr group with their SHA-256 digest added to the attributes."""
     attributes = {name: value for name, value in group_metadata["attributes"].items() if name != CHECKSUM_ATTRIBUTE}
     group_metadata = {**group_metadata, "attributes": attributes}
     digest = hashlib.sha256(json.dumps(group_metadata, sort_keys=True).encode()).hexdigest()
@@ -207,7 +211,7 @@ def with_checksum(group_metadata: dict[str, Any]) -> dict[str, Any]:
 
 
 def parse_group_metadata(root: Path, group_metadata: dict[str, Any]) -> tuple[dict[str, ZarrArray], dict[str, Any]]:
-    """Return the arrays and the attributes of a group, from its metadata, which may be foreign or damaged.
+    """Check the metadata of a Zarr group, which may be foreign or damaged, and return its arrays and attributes.
 
     Raises
     ------
@@ -248,12 +252,12 @@ def parse_group_metadata(root: Path, group_metadata: dict[str, Any]) -> tuple[di
             raise ValueError(f"no study writes the array {name!r} of this shape and type beside its other arrays")
     if not {dtype for _, dtype in values.values()} <= {"float64", "complex128"}:
         raise ValueError("its measures are not numbers")
-    _require_study(attributes, status.shape)
+    _check_study_attributes(attributes, status.shape)
     return arrays, attributes
 
 
-def _require_study(attributes: Mapping[str, Any], shape: tuple[int, ...]) -> None:
-    """Raise ValueError unless the attributes describe a study, with an example inside the axes."""
+def _check_study_attributes(attributes: Mapping[str, Any], shape: tuple[int, ...]) -> None:
+    """Raise ValueError unless the attributes of a store describe a study whose example point lies inside the axes."""
     dataclass_from_json(Laws, attributes["laws"])
     study = attributes["study"]
     if list(study["measures"]) != attributes["measures"]:
@@ -270,7 +274,7 @@ def _require_study(attributes: Mapping[str, Any], shape: tuple[int, ...]) -> Non
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write a file atomically: it appears complete or not at all.
+    """Write a file of a store atomically: it appears complete or not at all.
 
     Raises
     ------
@@ -290,7 +294,7 @@ class TemporaryFolder:
 
 
 def read_plain_file(path: Path) -> bytes:
-    """Return the content of a regular file; links are refused.
+    """Return the content of a regular file; raise FileError for a link or a device.
 
     Raises
     ------
@@ -309,7 +313,8 @@ def _open_no_follow(path: str, flags: int) -> int:
 
 
 def require_plain_files(root: Path) -> None:
-    """Raise FileError unless a store contains only files and folders: a link may lead outside, and a pipe may block."""
+    """Raise FileError unless a store contains only plain files and folders, as a link may lead outside and a pipe may
+    block."""
     folders = [os.fspath(root)]
     while folders:
         with disk.file_errors("read", root), os.scandir(folders.pop()) as entries:

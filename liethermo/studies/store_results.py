@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 
 def load_status(path: Any) -> StudyStatus:
-    """Return the status of the study in a store."""
+    """Return the progress of a study, with the number of points by status, read from the path of its store."""
     return store_status(StudyStore.open(Path(path)))
 
 
 def store_status(store: StudyStore) -> StudyStatus:
-    """Return the status of an open store."""
+    """Return the progress of the study in an open store, with the number of points by status."""
     counts, running = store.status_counts(), store_metadata.active_run_record(store.root)
     n_done = store.n_points - counts.get("missing", 0)
     time_left = None if running is None or "started" not in running else seconds_left(store.n_points, n_done, running)
@@ -45,15 +45,18 @@ def load_study(path: Any) -> xarray.Dataset:
     return open_results(Path(path), None)
 
 
-def open_results(path: Path, owner: object) -> xarray.Dataset:
-    """Return the results in a store; arrays are read at their first use, and keep ``owner`` alive until then."""
+def open_results(path: Path, keep_alive: object) -> xarray.Dataset:
+    """Return the results in a store as a dataset whose arrays are read at their first use.
+
+    The dataset holds a reference to ``keep_alive``, for example a temporary folder.
+    """
     store = StudyStore.open(path)
     import xarray
 
     from .reader import CheckedZarrReader
 
     try:
-        dataset = xarray.open_zarr(CheckedZarrReader(store, owner), consolidated=True, chunks=None)
+        dataset = xarray.open_zarr(CheckedZarrReader(store, keep_alive), consolidated=True, chunks=None)
     except FileError:
         raise
     except Exception as error:  # zarr and xarray raise many types

@@ -30,7 +30,7 @@ from .axes import Axes, Zipped, axes_in_store_order
 from .measures import At, Measure, SolutionMeasure, ValuesAtTimes, parse_measures_and_event
 from .members import UNKNOWN_PARAMETER_TEXT, AccessRecorder, system_builder, to_python_values
 from .progress import StudyProgressBar, StudyStatus
-from .running import run_locally, run_on_cluster
+from .running import solve_chunks_locally, solve_chunks_on_cluster
 from .solve import MEASURE_FAILED, STATUSES, PointResults, PointSolver, StudyTask, describe_error
 from .store import STORE_FORMAT, StoreSurvey, StudyStore
 from .store_results import audit_store, load_status, open_results, store_status
@@ -226,22 +226,23 @@ class Study(metaclass=ListedType):
             survey = store.survey()
             record_run(survey.n_done)
             try:
-                with StudyProgressBar(store.n_points, survey.n_done, progress) as bar:
-                    self._solve_remaining(store, axes, survey, bar, client)
+                with StudyProgressBar(store.n_points, survey.n_done, progress) as progress_bar:
+                    self._solve_remaining(store, axes, survey, progress_bar, client)
             except KeyboardInterrupt:
                 is_interrupted = True
         return dataclasses.replace(store_status(store), damaged=survey.damaged, interrupted=is_interrupted)
 
     def _solve_remaining(
-        self, store: StudyStore, axes: Axes, survey: StoreSurvey, bar: StudyProgressBar, client: Any
+        self, store: StudyStore, axes: Axes, survey: StoreSurvey, progress_bar: StudyProgressBar, client: Any
     ) -> None:
+        """Solve the unfinished chunks of the store, in this process or on the cluster of ``client``."""
         if not survey.remaining_chunks:
             return
         solver = self._solve_example(axes, tuple(store.study_description["place"]))[0]
         if client is None:
-            run_locally(solver, store, axes, survey, bar)
+            solve_chunks_locally(solver, store, axes, survey, progress_bar)
         else:
-            run_on_cluster(solver.task, store, axes, survey, bar, client)
+            solve_chunks_on_cluster(solver.task, store, axes, survey, progress_bar, client)
 
     def status(self) -> StudyStatus:
         """Return the progress of the study from its store, also while another process runs it.
@@ -291,7 +292,8 @@ class Study(metaclass=ListedType):
     # -- store and example ------------------------------------------------------------------------------------------
 
     def _open_or_create_store_and_axes(self) -> tuple[StudyStore, Axes]:
-        """Open or create the store, and return it with the axes in its order; a store of another study is refused."""
+        """Open or create the store; return it and the axes in its order, or raise InputError if another study made
+        it."""
         if not self.store.exists() or (self.store.is_dir() and not any(self.store.iterdir())):
             solver, columns, x0 = self._solve_example()
             description = {**identity.study_as_json(solver, columns, x0), "place": list(self._example_index)}
@@ -327,7 +329,7 @@ class Study(metaclass=ListedType):
         else:
             store = StudyStore.open(self.store)
         try:
-            axes = axes_in_store_order(self._axes, store.repair_axes(self._axes))
+            axes = axes_in_store_order(self._axes, store.read_or_repair_axes(self._axes))
             solver, columns, x0 = self._solve_example(axes, tuple(store.study_description["place"]))
             differences = identity.study_differences(
                 identity.study_as_json(solver, columns, x0), store.study_description
@@ -340,7 +342,7 @@ class Study(metaclass=ListedType):
         return store, axes
 
     def _points_per_chunk(self, solver: PointSolver) -> int:
-        """Return the number of points of a chunk for a new store."""
+        """Return the approximate number of points per chunk for a new store."""
         if self._chunk_points is not None:
             return self._chunk_points
         max_points = MAX_UNVECTORISED_CHUNK_POINTS if solver.systems.family is None else MAX_POINTS_PER_CHUNK
@@ -357,11 +359,11 @@ class Study(metaclass=ListedType):
             axes is None or self._example[0].task.example_point == _point_and_state_at(axes, index)[0]
         ):
             return self._example
-        axes, candidates = (self._axes, self._candidate_indices()) if axes is None else (axes, [index])
+        axes, candidates = (self._axes, self._example_candidate_indices()) if axes is None else (axes, [index])
         first_failure, n_failed = "", 0
         for index in candidates:
             seeds = None if self._task.noise is None else self._task.noise.grid_seeds([np.array([i]) for i in index])
-            reason, was_built = self._try_as_example(*_point_and_state_at(axes, index), seeds)
+            reason, was_built = self._try_to_solve_example(*_point_and_state_at(axes, index), seeds)
             if self._example is not None and not reason:
                 self._example_index = index
                 return self._example
@@ -371,18 +373,20 @@ class Study(metaclass=ListedType):
                 break
         raise InputError(f"no point of the study can be run; the first: {first_failure}")
 
-    def _candidate_indices(self) -> list[tuple[int, ...]]:
-        """Return the indices of possible example points, spread over the axes and beginning with the first point."""
+    def _example_candidate_indices(self) -> list[tuple[int, ...]]:
+        """Return the indices of candidates for the example point, spread over the axes; the first is the first
+        point."""
         size, shape = self._axes.size, self._axes.shape
         numbers = dict.fromkeys(int(size * _van_der_corput(k)) for k in range(MAX_CANDIDATE_POINTS))
         return [tuple(map(int, np.unravel_index(number, shape))) for number in numbers]
 
-    def _try_as_example(
+    def _try_to_solve_example(
         self, point: dict[str, Any], states: np.ndarray | None, seeds: np.ndarray | None
     ) -> tuple[str, bool]:
-        """Solve one point as the example; return the reason of a failure, or "", and True if its system was built."""
+        """Solve one point as the example of the study; return an error message, or "", and True if its system could be
+        built."""
         self._example = None
-        self._require_used_axes(point)
+        self._check_axes_are_used(point)
         try:
             solver = PointSolver(dataclasses.replace(self._task, example_point=point))
         except Exception as error:  # user code, which may raise at some points
@@ -406,12 +410,12 @@ class Study(metaclass=ListedType):
         return "", True
 
     def _initial_state(self, solver: PointSolver, point: dict[str, Any], states: np.ndarray | None) -> np.ndarray:
-        """Return the initial state of a point, shape (n,), checked by its system."""
+        """Return the initial state of a point, shape (n,), after its system has checked it."""
         source = self._task.x0
         x0 = states[0] if states is not None else source(AccessRecorder(point)) if callable(source) else source
         return np.asarray(solver.systems.example_system.state(x0), dtype=np.float64)
 
-    def _require_used_axes(self, point: dict[str, Any]) -> None:
+    def _check_axes_are_used(self, point: dict[str, Any]) -> None:
         """Raise InputError if an axis is used neither by the builder, nor by ``x0``, nor by ``attitude``."""
         recorder = AccessRecorder(to_python_values(point))
         for function in filter(callable, (self._task.build, self._task.x0, self._task.attitude)):
@@ -429,12 +433,12 @@ class Study(metaclass=ListedType):
 
 
 def _with_example_value(measure: Measure, value: np.ndarray) -> Measure:
-    """Return the measure with its value at the example point, if it is a user's function."""
+    """Return a measure that is a user's function with its value at the example point attached, and others unchanged."""
     return dataclasses.replace(measure, example_value=value) if isinstance(measure, SolutionMeasure) else measure
 
 
 def _point_and_state_at(axes: Axes, index: tuple[int, ...]) -> tuple[dict[str, Any], np.ndarray | None]:
-    """Return the parameters at an index, and the initial state, shape (1, n), if an axis has states."""
+    """Return the parameters of the point at an index, and its initial state, shape (1, n), or None without states."""
     indices = tuple(np.array([i]) for i in index)
     return to_python_values({name: values[0] for name, values in axes.parameters_at(indices).items()}), axes.states_at(
         indices

@@ -25,7 +25,7 @@ from ..functions.energy import Energy, make_energy
 from ..functions.on_spaces import energy_of_vectors, flatten_site_functions
 from ..tracing.short_form import arguments_form
 from ..tracing.traced import trace_callables
-from .baths import BathEntropy, HeatBaths, poisson_with_baths
+from .baths import NO_BATHS, BathEntropy, HeatBaths, checked_baths, poisson_with_baths
 from .check import AXIOM_TOLERANCE, CheckReport, check_system, require_axioms
 from .conservation import project_covector
 from .interface import SystemInterface
@@ -65,9 +65,9 @@ class System(SystemInterface):
         state_space = body.space if body.lie_algebra is None else body.lie_algebra
         parts = {
             "energy": body.energy,
-            "entropy": None if self.baths is not None and isinstance(body.entropy, BathEntropy) else body.entropy,
+            "entropy": None if isinstance(body.entropy, BathEntropy) else body.entropy,
             "dissipation": self.dissipation,
-            "baths": self.baths,
+            "baths": self.baths if self.baths.number else None,
             "torque": self.torque_laws.name,
         }
         name = f"{self.dim} components" if state_space is None else state_space.name
@@ -91,8 +91,7 @@ class System(SystemInterface):
 
         Without ``check_poisson`` an expensive check is skipped, because Pi is a Poisson tensor by construction.
         """
-        if not isinstance(baths, HeatBaths | None):
-            raise InputError(f"baths must be lt.HeatBaths(...), got {type(baths).__name__}")
+        baths = checked_baths(baths)
         self.dim, self.space = dim, space
         self.poisson = trace_callables(poisson, lambda poisson, x: poisson.sharp(x, x), (dim,))
         self.energy = checked_energy(
@@ -121,10 +120,12 @@ class System(SystemInterface):
         bath_terms = tuple(term for term in terms if drives_baths(term))
         dissipation = sum_dissipations([term for term in terms if not drives_baths(term)] or None)
         for term in bath_terms:
-            if baths is None and term.acts_on_baths_alone:
-                raise InputError(f"{type(term).__name__} acts on baths. Give the system baths=lt.HeatBaths(...)")
-            if baths is None:
-                raise InputError(f"{type(term).__name__} drives the entropy up, so the system needs an entropy")
+            if not baths.number:
+                raise InputError(
+                    f"{type(term).__name__} acts on baths. Give the system baths=lt.HeatBaths(...)"
+                    if term.acts_on_baths_alone
+                    else f"{type(term).__name__} drives the entropy up, so the system needs an entropy"
+                )
             if not term.can_drive_baths:
                 raise InputError(
                     f"{type(term).__name__} drives the entropy of the body up, which it needs beside the entropies of "
@@ -134,7 +135,7 @@ class System(SystemInterface):
         if dissipation is not None:
             dissipation = flatten_site_functions(dissipation, self.shape)
             self.dissipation = _bind_dissipation(self, dissipation)
-        if baths is not None:
+        if baths.number:
             _attach_baths(self, baths, bath_terms)
         if self.preserved and not is_traced(self):
             self.preserved_labels = find_preserved_names(self)
@@ -142,7 +143,7 @@ class System(SystemInterface):
             require_axioms(self, matrices=check_poisson)
 
     def drop_baths(self) -> System:
-        if self.baths is None:
+        if not self.baths.number:
             return self
         assert isinstance(self.poisson, ProductPoisson)
         return replace_fields(
@@ -151,7 +152,7 @@ class System(SystemInterface):
             space=None if self.space is None else _drop_last_factor(self.space),
             poisson=self.poisson.first,
             energy=self.energy.body if isinstance(self.energy, BodyBathsEnergy) else self.energy,
-            baths=None,
+            baths=NO_BATHS,
         )
 
     @with_library_settings
@@ -164,7 +165,7 @@ class System(SystemInterface):
         t : float or array, shape (...), optional
             The times of the states, if the temperatures depend on it.
         """
-        if self.baths is None:
+        if not self.baths.number:
             raise InputError("this system has no baths. Give it baths=lt.HeatBaths(...)")
         entropies, energy = jnp.asarray(x)[..., self.body_dim :], self.baths.energy
         if isinstance(self.energy, BodyBathsEnergy):  # which may be frozen at a time

@@ -16,7 +16,14 @@ from manifolds._pytree_module import Module
 from manifolds.structures.poisson import ProductPoisson
 
 from ..errors import InputError
-from ..functions.bath_energy import BathEnergy, DrivenReservoirEnergy, ReservoirEnergy, bath_terms, make_bath_energy
+from ..functions.bath_energy import (
+    BathEnergy,
+    DrivenReservoirEnergy,
+    ReservoirEnergy,
+    ZeroEnergy,
+    bath_terms,
+    make_bath_energy,
+)
 from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers
 from ..functions.energy import Energy, Sum
@@ -136,6 +143,29 @@ class HeatBaths(Module):
         return jnp.where(jnp.isfinite(self.energy.capacity), self.energy.capacity, 1.0)
 
 
+class _NoBaths(HeatBaths):
+    """Baths of number zero, of a system without baths."""
+
+    def __init__(self):
+        self.energy, self.number = ZeroEnergy(), 0
+
+
+NO_BATHS = _NoBaths()
+"""The baths of a system that has none."""
+
+
+def checked_baths(baths: HeatBaths | None) -> HeatBaths:
+    """Return the baths that a user gave to a system; without any, baths of number zero.
+
+    Raises
+    ------
+    InputError
+    """
+    if not isinstance(baths, HeatBaths | None):
+        raise InputError(f"baths must be lt.HeatBaths(...), got {type(baths).__name__}")
+    return NO_BATHS if baths is None else baths
+
+
 def _entries_of_baths(value, what: str, number: int) -> list:
     """Return an entry for each bath, from one for all or a sequence; a function to an array has an entry for each."""
     if callable(value):
@@ -195,9 +225,9 @@ class _BathEnergyFunction(Module):
         return self.energy(y[0])
 
 
-def poisson_with_baths(body: mf.PoissonStructure, number: int) -> ProductPoisson:
+def poisson_with_baths(body: mf.PoissonStructure, number: int) -> mf.PoissonStructure:
     """Return the Poisson structure of a body with baths, whose entropies have no conjugate variables."""
-    return ProductPoisson(body, mf.NoPoisson(number))
+    return ProductPoisson(body, mf.NoPoisson(number)) if number else body
 
 
 class BathEntropy(Energy):

@@ -184,15 +184,15 @@ def embed_in_arrays(system: System) -> System:
 def _sample_states(system: System) -> np.ndarray:
     """Return a few random states, without compiling a program if the space maps normal numbers to points."""
     space = _require_space(system)
-    if space._n_normal_numbers is None:
+    if space._n_gaussian_samples is None:
         return system.samples(3)
     return evaluate_at_points(
-        _state_from_normals, space, np.random.default_rng(2).standard_normal((3, space._n_normal_numbers))
+        _state_from_normals, space, np.random.default_rng(2).standard_normal((3, space._n_gaussian_samples))
     )
 
 
 def _state_from_normals(space: mf.Space, w):
-    return space.to_vector(space._point_from_normal_numbers(w))
+    return space.to_vector(space._point_from_gaussian_samples(w))
 
 
 def _inside_indicator(surface: ConstraintSurface, x):

@@ -26,6 +26,7 @@ from .linearisation import (
     derivatives_at,
     field_derivatives,
     frozen_system,
+    joined_names,
     linearise_at,
     values_of,
 )
@@ -94,7 +95,7 @@ class Equilibrium:
         return self.linearisation.stable
 
     def __str__(self) -> str:
-        levels = ", ".join(f"{name} = {value:.6g}" for name, value in self.levels.items())
+        levels = joined_names([f"{name} = {value:.6g}" for name, value in self.levels.items()])
         x = np.where(np.abs(self.x) > PRINTED_ZERO * np.abs(self.x).max(initial=0.0), self.x, 0.0)
         return f"{np.array2string(x, precision=6)}  {self.stability}, residual {self.residual:.1e}; {levels}"
 
@@ -138,7 +139,7 @@ class Equilibria(Sequence, metaclass=ListedABCMeta):
         return [member.stable for member in self.members]
 
     def __str__(self) -> str:
-        levels = f" with the reference's {', '.join(self.level_names)}" if self.level_names else ""
+        levels = f" with the reference's {joined_names(self.level_names)}" if self.level_names else ""
         head = f"{len(self)} equilibria{levels}, from {self.n_converged} of {self.n_starts} starting points"
         return "\n".join([head, *map(str, self.members)])
 
@@ -309,7 +310,7 @@ def _level_names(
         return tuple(name for name in conserved if name not in variable)
     names = (levels,) if isinstance(levels, str) else tuple(levels)
     if unknown := [name for name in names if name not in conserved]:
-        known = ", ".join(map(repr, conserved)) or "no function"
+        known = joined_names(list(map(repr, conserved))) or "no function"
         raise InputError(f"levels names {unknown[0]!r}, but this {system.kind} conserves {known}")
     return names
 
@@ -355,11 +356,9 @@ class _Search(NamedTuple):
         """Return velocities and functions at points, axis 0, with derivatives by the state; clock and work are left
         out."""
         derivatives = evaluate_at_points(field_derivatives, (self.system, self.functions), points)
-        if not self.counters.size:
-            return FieldDerivatives(*derivatives)
-        velocity, values, jacobian, gradients, frame = (np.array(a) for a in derivatives)
-        velocity[:, self.counters], jacobian[:, self.counters] = 0.0, 0.0
-        return FieldDerivatives(velocity, values, jacobian, gradients, frame)
+        derivatives = FieldDerivatives(*(np.array(a) for a in derivatives))  # solve() overwrites rows
+        derivatives.velocity[:, self.counters], derivatives.jacobian[:, self.counters] = 0.0, 0.0
+        return derivatives
 
     def solve(self, points: np.ndarray, scale: float) -> np.ndarray:
         """Return the equilibria reached from the points, shape (converged, n), by Levenberg-Marquardt steps."""

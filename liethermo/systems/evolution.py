@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import manifolds as mf
 from manifolds._pytree_module import Module
 
-from ..dissipation.base import SkewFriction, nondecreasing_if
+from ..dissipation.base import SkewFriction, nondecreasing_law_if
 from ..errors import InputError
 from ..functions.checks import checked_energy, with_polynomial_degrees
 from ..functions.energy import Energy, Quadratic, make_energy
@@ -57,7 +57,7 @@ class ContactManifoldSystem(System):
         entropy: Energy | None = None
         friction: LiouvilleFriction = ReebDrift()
         if self.is_isolated:
-            law = nondecreasing_if(is_mechanical(function, dim, space))
+            law = nondecreasing_law_if(is_mechanical(function, dim, space))
             entropy, friction = entropy_component(dim), LiouvilleFriction(law=law)
         parts = structure, dim, energy, entropy, friction, momentum_maps, validate
         self._build(*parts, state_space(space), check_poisson=space is None)

@@ -220,10 +220,10 @@ def tensor_with_identity(matrix: np.ndarray, k: int, sizes: Sequence[int]) -> np
     return np.kron(matrix, np.eye(sizes[1])) if k == 0 else np.kron(np.eye(sizes[0]), matrix)
 
 
-def join_baths(a: HeatBaths | None, b: HeatBaths | None) -> HeatBaths | None:
+def join_baths(a: HeatBaths, b: HeatBaths) -> HeatBaths:
     """Return the baths of a product of two systems, those of the first one first."""
-    if a is None or b is None:
-        return a or b
+    if not a.number or not b.number:
+        return a if a.number else b
     kinds = BathEnergy | ReservoirEnergy
     if not isinstance(a.energy, kinds) or not isinstance(b.energy, kinds):
         raise InputError("baths of a product have constant capacities: build the product with baths of its own")

@@ -17,7 +17,7 @@ from ..dissipation.base import ABSENT_DISSIPATION, Dissipation, LawName
 from ..dissipation.geometry import Geometry
 from ..functions.energy import Energy
 from ..functions.surface import Surface
-from .baths import HeatBaths
+from .baths import NO_BATHS, HeatBaths
 from .clock import Clock
 from .conditions import RunCondition
 from .domain import Domain
@@ -177,8 +177,8 @@ class SystemInterface(Geometry):
     """Names of the functions that the dissipation has to preserve, in their order."""
     invariant_verdicts: InvariantVerdicts | None = eqx.field(static=True, kw_only=True, default=None)
     """Functions that the system conserves, if they were determined near the states of a run."""
-    baths: HeatBaths | None = eqx.field(kw_only=True, default=None)
-    """Baths that take the heat of the dissipation; their entropies are the last components of a state."""
+    baths: HeatBaths = eqx.field(kw_only=True, default=NO_BATHS)
+    """Baths that take the heat of the dissipation, if any; their entropies are the last components of a state."""
     production_name: ClassVar[str] = "dS/dt"
 
     @property
@@ -189,7 +189,7 @@ class SystemInterface(Geometry):
     @property
     def body_dim(self) -> int:
         """Number of state components, those of baths left out."""
-        return self.dim if self.baths is None else self.dim - self.baths.number
+        return self.dim - self.baths.number
 
     @property
     def inertia(self) -> np.ndarray | None:
@@ -229,9 +229,8 @@ class SystemInterface(Geometry):
         if self.space is None:
             states = scale * np.random.default_rng(seed).standard_normal((count, self.dim))
         else:
-            states = np.asarray(self.space.to_vector(self.space.random(seed, (count,))))
-        if self.baths is not None:
-            states[..., self.body_dim :] *= min(1.0, 1.0 / scale) * self.baths.scale  # keeps temperatures finite
+            states = np.array(self.space.to_vector(self.space.random(seed, (count,))))
+        states[..., self.body_dim :] *= min(1.0, 1.0 / scale) * self.baths.scale  # keeps temperatures finite
         return states
 
     def resting_guess(self) -> np.ndarray:
@@ -356,6 +355,10 @@ class SystemInterface(Geometry):
         """Return the known Casimirs of the Poisson structure, by name."""
         return {}
 
+    def casimir_components(self) -> dict[str, dict[str, Energy]]:
+        """Return, by the name of a Casimir that is a sum, its terms by name, if each of them is a Casimir too."""
+        return {}
+
     @property
     def orbit_levels(self) -> OrbitLevels:
         """Casimirs whose common levels are the orbits of the group, and whether all Casimirs are known."""
@@ -390,7 +393,7 @@ class SystemInterface(Geometry):
     def state_blocks(self) -> tuple[slice, ...]:
         """Parts of a state that have scales of their own, such as a momentum and an attitude."""
         n = self.body_dim
-        return (slice(None),) if self.baths is None else (slice(0, n), slice(n, self.dim))
+        return (slice(0, n), slice(n, self.dim)) if self.baths.number else (slice(None),)
 
     # -- for the engines ----------------------------------------------------------------------------------------------
 

@@ -132,7 +132,7 @@ class LiePoissonSystem(TorqueSystem):
 
     @property
     def sites(self) -> tuple[int, ...]:
-        return () if self.baths is not None else self.algebra.shape[:-1]
+        return () if self.baths.number else self.algebra.shape[:-1]
 
     def _field_without_torque(self, x, dH, dS, dL):
         # all forces that are coadjoint actions are computed by one action, ad*_dH (x + F)
@@ -189,12 +189,11 @@ class LiePoissonSystem(TorqueSystem):
         details = {"rotor_rates": rotor_rates, "temperature": temperature}
         if not is_given_by_velocity(self, x, angular_velocity, "momentum", **details):
             return super().state(x, batch)
-        if temperature is not None and self.baths is None:
+        if temperature is not None and not self.baths.number:
             raise InputError("temperature= needs a system with baths. Build the system with baths=lt.HeatBaths(...)")
         velocity = checked_velocity(angular_velocity, rotor_rates, self.algebra.dim, batch)
         momentum = self.momentum_of_velocity(velocity, t)
         if temperature is not None:
-            assert self.baths is not None
             y = entropies_of_temperatures(self.baths, temperature)
             shape = jnp.broadcast_shapes(momentum.shape[:-1], y.shape[:-1])
             parts = (jnp.broadcast_to(part, (*shape, part.shape[-1])) for part in (momentum, y))
@@ -251,7 +250,7 @@ class LiePoissonSystem(TorqueSystem):
 
     def casimirs(self) -> dict[str, Energy]:
         casimirs = self.momentum_casimirs()
-        return casimirs if self.baths is None else {name: C.on(range(self.body_dim)) for name, C in casimirs.items()}
+        return {name: C.on(range(self.body_dim)) for name, C in casimirs.items()} if self.baths.number else casimirs
 
     def momentum_casimirs(self) -> dict[str, Energy]:
         """Return the known Casimirs as functions of mu alone, by name."""

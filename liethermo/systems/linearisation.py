@@ -45,6 +45,10 @@ UNKNOWN_CASIMIRS = "Casimirs without a formula"
 """Name of the level sets of Casimirs that are not known as functions; their tangent space is the range of Pi."""
 
 
+PRINTED_NAMES = 2
+"""Number of names at each end of a long list that are printed."""
+
+
 class Stability(enum.StrEnum, metaclass=ListedEnumType):
     """Stability of an equilibrium on its leaf."""
 
@@ -110,8 +114,6 @@ def counter_components(system: System) -> np.ndarray:
 
     The motion of the other components does not depend on them, so they may grow in a steady state.
     """
-    if system.baths is None:
-        return np.zeros(0, dtype=int)
     energy = system.baths.energy
     if isinstance(energy, BathEnergy):
         is_constant = np.isinf(np.asarray(energy.capacity))
@@ -171,7 +173,11 @@ def conserved_functions(system: System, x) -> dict[str, Energy]:
     """
     system = resolve_invariants_near(system, system.state_array(x, batch=True))
     functions = system.functions()
-    conserved = {name: g for name, g in functions.items() if name in system.first_integrals()}
+    first_integrals, components = system.first_integrals(), system.casimir_components()
+    conserved = {}
+    for name, g in functions.items():
+        if name in first_integrals:
+            conserved.update(components.get(name, {name: g}))
     if system.energy_law == "conserved" and not system.torque_laws.name:
         conserved["energy"] = system.energy
     counters = counter_components(system)
@@ -180,6 +186,14 @@ def conserved_functions(system: System, x) -> dict[str, Energy]:
     gradients = evaluate_at_points(stack_gradients, tuple(conserved.values()), np.atleast_2d(np.asarray(x)))
     keeps = ~gradients[:, :, counters].any(axis=(0, 2))
     return {name: g for (name, g), keep in zip(conserved.items(), keeps, strict=True) if keep}
+
+
+def joined_names(names: Sequence[str]) -> str:
+    """Return names in one text, of a long list the first and the last ones."""
+    if len(names) <= 2 * PRINTED_NAMES:
+        return ", ".join(names)
+    n_left_out = len(names) - 2 * PRINTED_NAMES
+    return ", ".join([*names[:PRINTED_NAMES], f"{n_left_out} more", *names[-PRINTED_NAMES:]])
 
 
 class Leaf(NamedTuple):
@@ -232,7 +246,7 @@ def _regular_kernel(system: System, x: np.ndarray, scale: float) -> np.ndarray |
     None if all Casimirs are known, if x lies on a leaf of lower dimension, or if the dissipation leaves the leaf.
     """
     by_form = dissipation_keeps_casimirs(system)
-    if not by_form or system.torque_laws.name or system.space is not None or system.baths is not None:
+    if not by_form or system.torque_laws.name or system.space is not None or system.baths.number:
         return None
     if system.orbit_levels.has_all_casimirs or system.dim > MAX_TENSOR_DIM:
         return None
@@ -312,7 +326,7 @@ class Linearisation:
         return bool((np.abs(self.eigenvalues) > self.eigenvalue_errors).all())
 
     def __str__(self) -> str:
-        leaf = ", ".join(self.leaf_names) or "no conserved function"
+        leaf = joined_names(self.leaf_names) or "no conserved function"
         head = (
             f"Equilibrium, {self.stability}, {len(self.eigenvalues)} modes on the leaf of: {leaf}\n"
             f"{'rate of decay':>16} {'angular frequency':>19}\n"

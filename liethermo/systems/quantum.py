@@ -32,7 +32,7 @@ from ..functions.density import (
 from ..functions.energy import Energy, Quadratic, Sum
 from ..functions.gradients import EPS
 from .base import System
-from .baths import BathEntropy, HeatBaths, poisson_with_baths
+from .baths import BathEntropy, HeatBaths, checked_baths, poisson_with_baths
 from .conditions import RunCondition
 from .domain import Domain
 from .equilibria import Equilibrium, steady_state
@@ -128,8 +128,7 @@ class QuantumSystem(System):
         validate: bool = False,
         times=None,
     ):
-        if not isinstance(baths, HeatBaths | None):
-            raise InputError(f"baths must be lt.HeatBaths(...), got {type(baths).__name__}")
+        baths = checked_baths(baths)
         self.time = None
         size, energy = hamiltonian_energy(hamiltonian, times)
         self.structure = structure = mf.DensityMatrices(size)
@@ -144,14 +143,14 @@ class QuantumSystem(System):
         if all(isinstance(term, LindbladJumps) for term in terms):
             entropy = IsolatedVonNeumann(self.floor)  # the motion does not depend on it
         terms = tuple(_bind_to_density(term, structure) for term in terms)
-        if baths is not None and not any(isinstance(term, ThermalJumps) for term in terms):
+        if baths.number and not any(isinstance(term, ThermalJumps) for term in terms):
             raise InputError(
                 "baths= needs lt.ThermalJumps, which exchange heat with the baths. Add them, or remove baths="
             )
-        n, m = structure.dim, 0 if baths is None else baths.number
+        n, m = structure.dim, baths.number
         poisson: mf.PoissonStructure = structure
         total_entropy: Energy = entropy
-        if baths is not None:
+        if baths.number:
             self.baths = baths
             poisson, energy = poisson_with_baths(structure, m), BodyBathsEnergy(energy, baths.energy, n, n + m)
             total_entropy = Sum((entropy.on(range(n)), BathEntropy(m)))
@@ -288,8 +287,6 @@ class QuantumSystem(System):
         rho = root @ adjoint(root)
         rho = rho / np.trace(rho, axis1=-2, axis2=-1)[:, None, None]
         x = np.asarray(self.structure.vector(rho))
-        if self.baths is None:
-            return x
         return np.concatenate([x, rng.standard_normal((count, self.baths.number)) * self.baths.scale], axis=-1)
 
     def resting_guess(self) -> np.ndarray:
@@ -452,7 +449,7 @@ class QuantumSystem(System):
         t : float or array, shape (...), optional
             The time, if the Hamiltonian depends on it.
         """
-        if self.baths is None:
+        if not self.baths.number:
             raise InputError("this system has no baths. Give it baths=lt.HeatBaths(...) and lt.ThermalJumps")
         return -self.temperatures(x, t) * self.vector_field(x, t)[..., self.body_dim :]
 
@@ -535,7 +532,7 @@ class QuantumSystem(System):
         trace = Quadratic(np.zeros(n), np.where(np.arange(n) < self.structure.size, 1.0, 0.0))
         if not self.total_dissipation.terms:
             return {"tr(rho)": trace, "tr(rho^2)": Quadratic(np.full(n, 2.0))}
-        return {"tr(rho)": trace if self.baths is None else trace.on(range(n))}
+        return {"tr(rho)": trace.on(range(n)) if self.baths.number else trace}
 
     # -- products -----------------------------------------------------------------------------------------------------
 
@@ -554,7 +551,7 @@ class QuantumSystem(System):
                 operators = [tensor_with_identity(np.asarray(V), k, sizes) for V in term.operators]
                 terms.append(term.replace_operators(operators, term.bath + offset))
             offset += s.dim - s.body_dim
-        if (self.baths is None) != (other.baths is None) and all(s.total_dissipation.terms for s in systems):
+        if (self.baths.number == 0) != (other.baths.number == 0) and all(s.total_dissipation.terms for s in systems):
             raise InputError(
                 "the jumps of one part have a bath, but those of the other none. Give baths to both parts or to neither"
             )

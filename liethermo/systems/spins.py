@@ -27,6 +27,7 @@ from ..functions.energy import Energy
 from ..functions.magnetism.spin_energy import lattice_shape
 from ..functions.magnetism.spin_torques import checked_spin_torque
 from ..functions.on_spaces import (
+    HalfSquareOfSpin,
     HalfSumOfSquares,
     Spheres,
     energy_in_component_order,
@@ -36,7 +37,7 @@ from ..functions.on_spaces import (
     to_site_order,
 )
 from .base import System
-from .baths import HeatBaths, poisson_with_baths
+from .baths import HeatBaths, checked_baths, poisson_with_baths
 from .interface import TorqueLaws
 from .torque import TorqueSystem, torque_name
 
@@ -117,7 +118,7 @@ class SpinSystem(TorqueSystem):
         self.lattice = lattice_shape(sites)
         self.torque = None if torque is None else checked_spin_torque(torque, self.lattice)
         self.torque_arguments = None
-        self.powered_baths, self.power = _checked_powers(power, baths)
+        self.powered_baths, self.power = _checked_powers(power, checked_baths(baths))
         poisson = mf.Spins(self.lattice, ratio=ratio)
         self._build(poisson, poisson.dim, energy, None, dissipation, momentum_maps, validate, baths=baths)
 
@@ -256,6 +257,10 @@ class SpinSystem(TorqueSystem):
     def casimirs(self) -> dict[str, Energy]:
         return {SPIN_LENGTHS_NAME: HalfSumOfSquares(math.prod(self.lattice))}
 
+    def casimir_components(self) -> dict[str, dict[str, Energy]]:
+        count = math.prod(self.lattice)
+        return {SPIN_LENGTHS_NAME: {f"|s|^2 / 2 at {i + 1}": HalfSquareOfSpin(i) for i in range(count)}}
+
     @property
     def surface(self) -> Spheres:
         assert self._spin_structure is not None
@@ -314,7 +319,7 @@ def reorder_spins(system: System) -> ReorderedSystem | None:
         return None
     count = spins.count
     planar = mf.Spins(spins.sites, 0, spins.ratio, interaction_range(system.energy, spins.sites))
-    poisson = planar if system.baths is None else poisson_with_baths(planar, system.baths.number)
+    poisson = poisson_with_baths(planar, system.baths.number)
     maps = (functools.partial(f, count=count) for f in (to_component_order, to_site_order, energy_in_component_order))
     reorder, restore, pullback = maps
     functions = [pullback(f) for f in (system.energy, *system.momentum_maps.values())]
@@ -322,11 +327,11 @@ def reorder_spins(system: System) -> ReorderedSystem | None:
     return ReorderedSystem(reordered, reorder, restore, pullback)
 
 
-def _checked_powers(power, baths: HeatBaths | None) -> tuple[tuple[int, ...], tuple[Callable, ...]]:
+def _checked_powers(power, baths: HeatBaths) -> tuple[tuple[int, ...], tuple[Callable, ...]]:
     """Return the indices of the baths that receive power, and their powers as traced functions of the time."""
     if power is None:
         return (), ()
-    if not isinstance(baths, HeatBaths):
+    if not baths.number:
         raise InputError("power= heats baths, and there are none. Give baths=lt.HeatBaths(...)")
     entries = list(power) if isinstance(power, list | tuple) else [power, *[None] * (baths.number - 1)]
     if len(entries) != baths.number:

@@ -29,7 +29,7 @@ def checked_state_array(system: Any, x, batch: bool = False) -> np.ndarray | jax
         x = system.space.to_vector(x)
     if system.sites and x.shape[-len(system.shape) :] == system.shape:
         x = x.reshape(*x.shape[: -len(system.shape)], system.dim)
-    if system.baths is not None and x.shape[-1:] != (system.dim,):
+    if x.shape[-1:] != (system.dim,):
         x = _append_bath_entropies(system, x)
     if jnp.iscomplexobj(x):
         raise InputError(f"a state must be real, got {x.dtype}. Take its real part if that is meant")

@@ -14,7 +14,7 @@ import numpy as np
 import manifolds as mf
 from manifolds._pytree_module import replace_fields
 
-from ..errors import FunctionError, InputError
+from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..functions.time_span import is_spline, required_argument_count
 from ..tracing.interpret import MAX_UNROLLED_DIM, vanishing_entry_indices
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
@@ -118,6 +118,8 @@ def traced_torque_and_argument_counts(
         torque, values = trace_callables_and_result_shapes(given, evaluate_terms, *shapes)
     except InputError:  # of a torque of the library, which says what it needs
         raise
+    except IndexOutOfRangeError as error:
+        raise error.with_function(f"the torque, at a momentum of shape {algebra.shape},") from None
     except TRACE_ERRORS as error:
         what = f"the torque could not be evaluated on a momentum of shape {algebra.shape}"
         raise FunctionError(trace_error_message(what, error)) from error

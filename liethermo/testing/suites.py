@@ -277,7 +277,7 @@ def check_dissipation(dissipation: Dissipation | System, algebra: mf.LieAlgebra 
     tested, max_energy_rate, min_entropy_rate, max_force = system.dissipation, 0.0, 0.0, 0.0
     for x in points:
         dH, dS, *dL = random.standard_normal((2 + len(tested.preserve), system.dim))
-        if system.baths is not None and system.baths.has_positive_temperatures:
+        if system.baths.has_positive_temperatures:
             dH[system.body_dim :] = np.abs(dH[system.body_dim :])  # no gradient has temperatures below zero
         force = np.asarray(
             tested.force(system, jnp.asarray(x), jnp.asarray(dH), jnp.asarray(dS), tuple(map(jnp.asarray, dL)))

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import LieAlgebraError
-from ._subspaces import complement, coordinates, intersection, is_exact, null_space, products, row_space
+from ._subspaces import brackets_of_rows, complement, coordinates, intersection, is_exact, null_space, row_space
 from .substructure import WorkingConstants, centralizer
 
 ZERO_TOLERANCE = 1e-9
@@ -27,7 +27,7 @@ CLUSTER_ROUNDING = 1e-12
 """Rounding of a matrix of size 1, whose k-th root bounds the spread of the k values of a defective eigenvalue."""
 
 
-class UnclearError(LieAlgebraError):
+class AmbiguousRoundingError(LieAlgebraError):
     """Raised when rounding does not allow a decision about a rank or an eigenvalue."""
 
 
@@ -43,10 +43,10 @@ class JordanBlock(NamedTuple):
 
 
 def is_zero(value: float, scale: float = 1.0) -> bool:
-    """Return whether a number is zero relative to a scale; raise UnclearError in the gap between the tolerances."""
+    """Return True if a number is zero relative to a scale; raise AmbiguousRoundingError if rounding does not tell."""
     size = abs(value) / scale
     if ZERO_TOLERANCE < size < NONZERO_TOLERANCE:
-        raise UnclearError(f"a value of relative size {size:.1e} may be zero or rounding")
+        raise AmbiguousRoundingError(f"a value of relative size {size:.1e} may be zero or rounding")
     return size <= ZERO_TOLERANCE
 
 
@@ -55,7 +55,7 @@ def jordan_blocks(matrix: np.ndarray) -> list[JordanBlock]:
 
     Raises
     ------
-    UnclearError
+    AmbiguousRoundingError
         If eigenvalues or ranks cannot be told apart from rounding.
     """
     values = matrix.astype(np.float64)
@@ -71,9 +71,11 @@ def jordan_blocks(matrix: np.ndarray) -> list[JordanBlock]:
         power, ranks = np.eye(n, dtype=complex), [n]
         for _ in range(multiplicity + 1):
             power = power @ shifted
-            ranks.append(_rank(power))
+            ranks.append(_numerical_rank(power))
         if n - ranks[-1] != multiplicity:
-            raise UnclearError("the rank of a power of a matrix disagrees with the multiplicity of its eigenvalue")
+            raise AmbiguousRoundingError(
+                "the rank of a power of a matrix disagrees with the multiplicity of its eigenvalue"
+            )
         drops = [ranks[k] - ranks[k + 1] for k in range(multiplicity + 1)]
         for size in range(multiplicity, 0, -1):
             blocks += [JordanBlock(eigenvalue, size)] * (drops[size - 1] - drops[size])
@@ -88,13 +90,13 @@ def distinct_eigenvalues(matrix: np.ndarray) -> list[tuple[complex, int]]:
             leading = max(abs(c) for c in factor)
             groups += [(root, multiplicity) for root in np.roots([float(c / leading) for c in factor])]
     else:
-        groups = _clusters(np.linalg.eigvals(matrix), float(np.abs(matrix).max()) or 1.0)
+        groups = _cluster_eigenvalues(np.linalg.eigvals(matrix), float(np.abs(matrix).max()) or 1.0)
     scale = float(np.abs(matrix.astype(np.float64)).max()) or 1.0
     real_or_upper = [(root.real + 0j if is_zero(root.imag, scale) else root, m) for root, m in groups]
     return [(complex(root), m) for root, m in real_or_upper if root.imag >= 0.0]
 
 
-def _clusters(eigenvalues: np.ndarray, scale: float) -> list[tuple[complex, int]]:
+def _cluster_eigenvalues(eigenvalues: np.ndarray, scale: float) -> list[tuple[complex, int]]:
     """Return means of clusters of eigenvalues that rounding may have spread, and the numbers of their members."""
     groups: list[list[complex]] = []
     for value in sorted(eigenvalues, key=lambda z: (z.real, z.imag)):
@@ -115,11 +117,12 @@ def _clusters(eigenvalues: np.ndarray, scale: float) -> list[tuple[complex, int]
         mean = sum(group) / len(group)
         spread = max(abs(value - mean) for value in group)
         if spread > CLUSTER_ROUNDING ** (1.0 / len(group)) * scale:
-            raise UnclearError(f"{len(group)} eigenvalues differ by {spread:.1e}, which may be rounding")
+            raise AmbiguousRoundingError(f"{len(group)} eigenvalues differ by {spread:.1e}, which may be rounding")
     return [(complex(sum(group) / len(group)), len(group)) for group in groups]
 
 
-def _rank(matrix: np.ndarray) -> int:
+def _numerical_rank(matrix: np.ndarray) -> int:
+    """Return the number of singular values that are not zero; raise AmbiguousRoundingError if one is in the gap."""
     singular_values = np.linalg.svd(matrix, compute_uv=False)
     return sum(not is_zero(value) for value in singular_values)
 
@@ -142,41 +145,44 @@ def characteristic_polynomial(matrix: np.ndarray) -> Coefficients:
 def squarefree_factors(polynomial: Coefficients) -> list[tuple[Coefficients, int]]:
     """Return the squarefree factors of positive degree, and their multiplicities [Yun 1976]."""
     factors = []
-    divisor = _gcd(polynomial, _derivative(polynomial))
-    remaining, multiplicity = _divide(polynomial, divisor)[0], 1
+    divisor = _polynomial_gcd(polynomial, _polynomial_derivative(polynomial))
+    remaining, multiplicity = _polynomial_divide(polynomial, divisor)[0], 1
     while len(remaining) > 1:
-        common = _gcd(remaining, divisor)
-        factor = _divide(remaining, common)[0]
+        common = _polynomial_gcd(remaining, divisor)
+        factor = _polynomial_divide(remaining, common)[0]
         if len(factor) > 1:
             factors.append((factor, multiplicity))
-        remaining, divisor = common, _divide(divisor, common)[0]
+        remaining, divisor = common, _polynomial_divide(divisor, common)[0]
         multiplicity += 1
     return factors
 
 
-def _derivative(polynomial: Coefficients) -> Coefficients:
+def _polynomial_derivative(polynomial: Coefficients) -> Coefficients:
+    """Return the coefficients of the derivative of a polynomial."""
     n = len(polynomial) - 1
     return [c * (n - i) for i, c in enumerate(polynomial[:-1])] or [Fraction(0)]
 
 
-def _divide(numerator: Coefficients, denominator: Coefficients) -> tuple[Coefficients, Coefficients]:
-    quotient, rest = [], list(numerator)
-    while len(rest) >= len(denominator):
-        factor = rest[0] / denominator[0]
+def _polynomial_divide(numerator: Coefficients, denominator: Coefficients) -> tuple[Coefficients, Coefficients]:
+    """Return the quotient and the remainder of two polynomials."""
+    quotient, remainder = [], list(numerator)
+    while len(remainder) >= len(denominator):
+        factor = remainder[0] / denominator[0]
         quotient.append(factor)
         for i, c in enumerate(denominator):
-            rest[i] -= factor * c
-        rest.pop(0)
-    while rest and not rest[0]:
-        rest.pop(0)
-    return quotient, rest
+            remainder[i] -= factor * c
+        remainder.pop(0)
+    while remainder and not remainder[0]:
+        remainder.pop(0)
+    return quotient, remainder
 
 
-def _gcd(first: Coefficients, second: Coefficients) -> Coefficients:
-    second = second if any(second) else []
-    while second:
-        first, second = second, _divide(first, second)[1]
-    return [c / first[0] for c in first]
+def _polynomial_gcd(p: Coefficients, q: Coefficients) -> Coefficients:
+    """Return the greatest common divisor of two polynomials, with leading coefficient 1."""
+    q = q if any(q) else []
+    while q:
+        p, q = q, _polynomial_divide(p, q)[1]
+    return [c / p[0] for c in p]
 
 
 def ratio_or_zero(value: float, scale: float) -> float:
@@ -192,41 +198,54 @@ Summand = tuple[str, tuple[tuple[str, float], ...]]
 
 def solvable_type(work: WorkingConstants, nilradical: np.ndarray) -> Summand:
     """Return the type of an indecomposable solvable algebra that is not nilpotent."""
-    outside = complement(nilradical, work.whole_space, work.name)
-    derived = work.span_of_brackets(nilradical, nilradical)
-    if len(outside) == 1:
-        if not len(derived):
-            return _line_on_abelian(jordan_blocks(_action(work, outside[0], nilradical, derived)))
+    complement_rows = complement(nilradical, work.full_space_rows, work.name)
+    derived_ideal = work.span_of_brackets(nilradical, nilradical)
+    if len(complement_rows) == 1:
+        if not len(derived_ideal):
+            return _type_of_line_acting_on_abelian(
+                jordan_blocks(_ad_matrix_on_quotient(work, complement_rows[0], nilradical, derived_ideal))
+            )
         if work.dim == 4:
-            return _line_on_heisenberg(jordan_blocks(_action(work, outside[0], nilradical, derived)))
-        if len(derived) == 2:
-            return _line_on_engel(work, nilradical, derived, outside[0])
-        return _line_on_heisenberg_and_line(work, nilradical, derived, outside[0])
-    if len(outside) == 2 and work.dim == 4:
+            return _type_of_line_acting_on_heisenberg(
+                jordan_blocks(_ad_matrix_on_quotient(work, complement_rows[0], nilradical, derived_ideal))
+            )
+        if len(derived_ideal) == 2:
+            return _type_of_line_acting_on_engel(work, nilradical, derived_ideal, complement_rows[0])
+        return _type_of_line_acting_on_heisenberg_plus_line(work, nilradical, derived_ideal, complement_rows[0])
+    if len(complement_rows) == 2 and work.dim == 4:
         return ("A4,12", ())
-    if len(outside) == 2 and work.dim == 5:
-        matrices = [_action(work, x, nilradical, derived).astype(np.float64) for x in outside]
-        return _first_clear_type(matrices, _plane_on_heisenberg if len(derived) else _plane_on_abelian)
+    if len(complement_rows) == 2 and work.dim == 5:
+        matrices = [
+            _ad_matrix_on_quotient(work, x, nilradical, derived_ideal).astype(np.float64) for x in complement_rows
+        ]
+        return _first_clear_type(
+            matrices, _type_of_plane_acting_on_heisenberg if len(derived_ideal) else _type_of_plane_acting_on_abelian
+        )
     raise LieAlgebraError(f"{work.name} has a solvable summand with a nilradical of dimension {len(nilradical)}")
 
 
-def _action(work: WorkingConstants, x: np.ndarray, ideal: np.ndarray, quotient: np.ndarray) -> np.ndarray:
+def _ad_matrix_on_quotient(
+    work: WorkingConstants, x: np.ndarray, ideal: np.ndarray, smaller_ideal: np.ndarray
+) -> np.ndarray:
     """Return the matrix, rows being images, of ``y -> [y, x]`` on an ideal modulo a smaller ideal."""
-    representatives = complement(quotient, ideal, work.name)
-    images = products(representatives, x[None], work.constants)[:, 0]
-    basis = np.vstack([representatives, row_space(quotient, work.name)])
+    representatives = complement(smaller_ideal, ideal, work.name)
+    images = brackets_of_rows(representatives, x[None], work.constants)[:, 0]
+    basis = np.vstack([representatives, row_space(smaller_ideal, work.name)])
     return coordinates(basis, images)[:, : len(representatives)]
 
 
 def _make_summand(name: str, **parameters: float) -> Summand:
+    """Return the name of an algebra of the list with its parameters as floats."""
     return (name, tuple((key, float(value)) for key, value in parameters.items()))
 
 
-def _sizes(blocks: list[JordanBlock]) -> tuple[int, ...]:
+def _block_sizes(blocks: list[JordanBlock]) -> tuple[int, ...]:
+    """Return the sizes of Jordan blocks in descending order."""
     return tuple(sorted((block.size for block in blocks), reverse=True))
 
 
-def _scale(blocks: list[JordanBlock]) -> float:
+def _max_abs_eigenvalue(blocks: list[JordanBlock]) -> float:
+    """Return the largest absolute value of the eigenvalues of Jordan blocks."""
     return max(abs(block.eigenvalue) for block in blocks)
 
 
@@ -244,18 +263,19 @@ def _normalize_by_largest(values: list[float]) -> tuple[float, ...]:
 # -- an abelian nilradical of codimension one --------------------------------------------------------------------
 
 
-def _line_on_abelian(blocks: list[JordanBlock]) -> Summand:
+def _type_of_line_acting_on_abelian(blocks: list[JordanBlock]) -> Summand:
+    """Return the type of an algebra whose element outside an abelian nilradical acts with these Jordan blocks."""
     real = [block for block in blocks if not block.is_complex]
     pairs = [block for block in blocks if block.is_complex]
     if pairs and not real:
-        return _rotations(pairs)
+        return _type_of_rotations(pairs)
     if pairs:
-        return _rotation_and_lines(pairs[0], real)
-    scale = _scale(blocks)
+        return _type_of_rotation_and_real_blocks(pairs[0], real)
+    scale = _max_abs_eigenvalue(blocks)
     values = [block.eigenvalue.real for block in real]
     sizes = tuple(block.size for block in real)
     if set(sizes) == {1}:
-        return _diagonal(_normalize_by_largest(values))
+        return _type_of_diagonal_action(_normalize_by_largest(values))
     head = values[0]
     if len(values) == 1:
         return ({2: "A3,2", 3: "A4,4", 4: "A5,12"}[sizes[0]], ())
@@ -273,7 +293,8 @@ def _line_on_abelian(blocks: list[JordanBlock]) -> Summand:
     return _make_summand("A5,9", b=others[0], c=others[1])
 
 
-def _diagonal(ratios: tuple[float, ...]) -> Summand:
+def _type_of_diagonal_action(ratios: tuple[float, ...]) -> Summand:
+    """Return the type for a diagonal action on an abelian nilradical, from the ratios of its eigenvalues."""
     if len(ratios) == 1:
         if is_zero(ratios[0] - 1.0):
             return ("A3,3", ())
@@ -282,7 +303,8 @@ def _diagonal(ratios: tuple[float, ...]) -> Summand:
     return _make_summand("A4,5" if len(ratios) == 2 else "A5,7", **dict(zip(names, ratios, strict=True)))
 
 
-def _rotation_and_lines(pair: JordanBlock, real: list[JordanBlock]) -> Summand:
+def _type_of_rotation_and_real_blocks(pair: JordanBlock, real: list[JordanBlock]) -> Summand:
+    """Return the type for an action on an abelian nilradical with one complex pair and one or two real eigenvalues."""
     re, im = pair.eigenvalue.real, pair.eigenvalue.imag
     values = [block.eigenvalue.real for block in real]
     if len(values) == 1 and real[0].size == 1:
@@ -302,7 +324,8 @@ def _rotation_and_lines(pair: JordanBlock, real: list[JordanBlock]) -> Summand:
     return _make_summand("A5,13", a=a, p=p, s=s)
 
 
-def _rotations(pairs: list[JordanBlock]) -> Summand:
+def _type_of_rotations(pairs: list[JordanBlock]) -> Summand:
+    """Return the type for an action on an abelian nilradical whose eigenvalues are complex pairs only."""
     if len(pairs) == 1 and pairs[0].size == 2:
         return _make_summand("A5,18", p=abs(ratio_or_zero(pairs[0].eigenvalue.real, pairs[0].eigenvalue.imag)))
     if len(pairs) == 1:
@@ -324,7 +347,8 @@ def _rotations(pairs: list[JordanBlock]) -> Summand:
 # -- a Heisenberg nilradical, or one of its sums with a line ----------------------------------------------------
 
 
-def _line_on_heisenberg(blocks: list[JordanBlock]) -> Summand:
+def _type_of_line_acting_on_heisenberg(blocks: list[JordanBlock]) -> Summand:
+    """Return one of A4,7 to A4,11, from the Jordan blocks of an action on the Heisenberg algebra modulo its centre."""
     if blocks[0].size == 2:
         return ("A4,7", ())
     if blocks[0].is_complex:
@@ -334,21 +358,23 @@ def _line_on_heisenberg(blocks: list[JordanBlock]) -> Summand:
     return ("A4,8", ()) if is_zero(b + 1.0) else _make_summand("A4,9", b=b)
 
 
-def _line_on_heisenberg_and_line(work: WorkingConstants, nil, derived, x: np.ndarray) -> Summand:
-    """Return one of A5,19 to A5,29, where x acts on ``nil``, the sum of a Heisenberg algebra and a line."""
-    inner_centre = row_space(_centre_of_ideal(work, nil), work.name)
-    plane = jordan_blocks(_action(work, x, nil, inner_centre))
-    with_line = jordan_blocks(_action(work, x, nil, derived))
-    centre_blocks = jordan_blocks(_action(work, x, inner_centre, derived[:0]))
-    line = float(_action(work, x, inner_centre, derived)[0, 0])
-    trace = float(_action(work, x, derived, derived[:0])[0, 0])
+def _type_of_line_acting_on_heisenberg_plus_line(
+    work: WorkingConstants, nilradical, derived_ideal, x: np.ndarray
+) -> Summand:
+    """Return one of A5,19 to A5,29, where x acts on ``nilradical``, the sum of a Heisenberg algebra and a line."""
+    inner_centre = row_space(_centre_of_ideal(work, nilradical), work.name)
+    plane = jordan_blocks(_ad_matrix_on_quotient(work, x, nilradical, inner_centre))
+    with_line = jordan_blocks(_ad_matrix_on_quotient(work, x, nilradical, derived_ideal))
+    centre_blocks = jordan_blocks(_ad_matrix_on_quotient(work, x, inner_centre, derived_ideal[:0]))
+    line = float(_ad_matrix_on_quotient(work, x, inner_centre, derived_ideal)[0, 0])
+    trace = float(_ad_matrix_on_quotient(work, x, derived_ideal, derived_ideal[:0])[0, 0])
     line_moves_centre = centre_blocks[0].size == 2
     plane_moves_line = len(with_line) < len(plane) + 1
     if plane[0].is_complex:
         z = plane[0].eigenvalue
         p, b = max((ratio_or_zero(z.real, sign * z.imag), ratio_or_zero(line, sign * z.imag)) for sign in (1, -1))
         return _make_summand("A5,26", p=p, eps=1) if line_moves_centre else _make_summand("A5,25", b=b, p=p)
-    scale = max(_scale(plane), abs(line))
+    scale = max(_max_abs_eigenvalue(plane), abs(line))
     if plane[0].size == 2:
         value = plane[0].eigenvalue.real
         if is_zero(value, scale):
@@ -373,26 +399,28 @@ def _line_on_heisenberg_and_line(work: WorkingConstants, nil, derived, x: np.nda
 
 def _centre_of_ideal(work: WorkingConstants, ideal: np.ndarray) -> np.ndarray:
     """Return rows that span the centre of an ideal."""
-    from_inside = products(ideal, ideal, work.constants).reshape(len(ideal), -1)
+    from_inside = brackets_of_rows(ideal, ideal, work.constants).reshape(len(ideal), -1)
     return null_space(from_inside.T, work.name) @ ideal
 
 
 # -- the nilradical A4,1 ---------------------------------------------------------------------------------------------
 
 
-def _line_on_engel(work: WorkingConstants, nil, derived, x: np.ndarray) -> Summand:
-    """Return one of A5,30 to A5,32, where x acts on ``nil``, which is of type A4,1."""
-    commutant = centralizer(work, derived)
-    rows = intersection(commutant, nil, work.name)
-    last = float(_action(work, x, nil, rows)[0, 0])
-    third = float(_action(work, x, rows, derived)[0, 0])
-    blocks = jordan_blocks(_action(work, x, nil, derived))
-    if not is_zero(last, max(abs(last), abs(third))):
+def _type_of_line_acting_on_engel(work: WorkingConstants, nilradical, derived_ideal, x: np.ndarray) -> Summand:
+    """Return one of A5,30 to A5,32, where x acts on ``nilradical``, which is of type A4,1."""
+    commutant = centralizer(work, derived_ideal)
+    rows = intersection(commutant, nilradical, work.name)
+    outer_action = float(_ad_matrix_on_quotient(work, x, nilradical, rows)[0, 0])
+    inner_action = float(_ad_matrix_on_quotient(work, x, rows, derived_ideal)[0, 0])
+    blocks = jordan_blocks(_ad_matrix_on_quotient(work, x, nilradical, derived_ideal))
+    if not is_zero(outer_action, max(abs(outer_action), abs(inner_action))):
         if blocks[0].size == 2:
             return ("A5,31", ())
-        return _make_summand("A5,30", a=ratio_or_zero(third, last) + 1.0)
-    motion = _action(work, x, rows, derived[:0]).astype(np.float64) / third
-    shift = _action(work, complement(rows, nil, work.name)[0], rows, derived[:0]).astype(np.float64)
+        return _make_summand("A5,30", a=ratio_or_zero(inner_action, outer_action) + 1.0)
+    motion = _ad_matrix_on_quotient(work, x, rows, derived_ideal[:0]).astype(np.float64) / inner_action
+    shift = _ad_matrix_on_quotient(work, complement(rows, nilradical, work.name)[0], rows, derived_ideal[:0]).astype(
+        np.float64
+    )
     shift = shift / np.linalg.norm(shift @ shift) ** 0.5
     square = shift @ shift
     design = np.stack([shift.ravel(), square.ravel()], axis=1)
@@ -418,20 +446,21 @@ def _first_clear_type(
     for angle in GENERIC_ANGLES:
         try:
             return recognise([first, second], np.cos(angle) * first + np.sin(angle) * second)
-        except UnclearError as error:
+        except AmbiguousRoundingError as error:
             reasons.append(error)
     raise reasons[0]
 
 
-def _plane_on_heisenberg(matrices: list[np.ndarray], generic: np.ndarray) -> Summand:
+def _type_of_plane_acting_on_heisenberg(matrices: list[np.ndarray], generic: np.ndarray) -> Summand:
+    """Return A5,36 or A5,37: a generic element acts on the nilradical with real or with complex eigenvalues."""
     return ("A5,37" if any(block.is_complex for block in jordan_blocks(generic)) else "A5,36", ())
 
 
-def _plane_on_abelian(matrices: list[np.ndarray], generic: np.ndarray) -> Summand:
+def _type_of_plane_acting_on_abelian(matrices: list[np.ndarray], generic: np.ndarray) -> Summand:
     """Return A5,33, A5,34, A5,35, A5,38 or A5,39: two commuting matrices that act on R^3, rows being images."""
     blocks = jordan_blocks(generic)
-    if _sizes(blocks) == (2, 1) and not any(block.is_complex for block in blocks):
-        return _shear_and_line(matrices, generic, blocks)
+    if _block_sizes(blocks) == (2, 1) and not any(block.is_complex for block in blocks):
+        return _type_of_shear_and_scaling(matrices, generic, blocks)
     eigenvalues, vectors = np.linalg.eig(generic)
     inverse = np.linalg.inv(vectors)
     weights = np.array([np.diag(inverse @ matrix @ vectors) for matrix in matrices]).T  # of each eigenvector
@@ -451,31 +480,35 @@ def _plane_on_abelian(matrices: list[np.ndarray], generic: np.ndarray) -> Summan
     line = weights[int(np.argmin(np.abs(eigenvalues.imag)))].real
     if is_zero(float(np.abs(line).max())):
         return ("A5,39", ())
-    parts = np.array([weights[pair].real, weights[pair].imag])
-    if abs(np.linalg.det(parts)) < 1e-7:
-        raise UnclearError("the dilation and the rotation of a plane are nearly dependent")
-    b, a = np.linalg.solve(parts.T, line)
+    real_and_imaginary = np.array([weights[pair].real, weights[pair].imag])
+    if abs(np.linalg.det(real_and_imaginary)) < 1e-7:
+        raise AmbiguousRoundingError("the dilation and the rotation of a plane are nearly dependent")
+    b, a = np.linalg.solve(real_and_imaginary.T, line)
     return _make_summand("A5,35", a=abs(ratio_or_zero(a, 1.0)), b=ratio_or_zero(b, 1.0))
 
 
-def _shear_and_line(matrices: list[np.ndarray], generic: np.ndarray, blocks: list[JordanBlock]) -> Summand:
-    """Return A5,34: one plane is sheared, and a line scaled."""
-    double = next(block.eigenvalue.real for block in blocks if block.size == 2)
-    single = next(block.eigenvalue.real for block in blocks if block.size == 1)
+def _type_of_shear_and_scaling(matrices: list[np.ndarray], generic: np.ndarray, blocks: list[JordanBlock]) -> Summand:
+    """Return A5,34 with its parameter: two commuting matrices shear and dilate a plane, and scale a line."""
+    double_eigenvalue = next(block.eigenvalue.real for block in blocks if block.size == 2)
+    single_eigenvalue = next(block.eigenvalue.real for block in blocks if block.size == 1)
     identity = np.eye(3)
-    nilpotent = (generic - double * identity) @ (generic - single * identity)  # a multiple of the shear
-    on_plane = np.linalg.matrix_power(generic - double * identity, 2) / (single - double) ** 2  # projects on the line
-    plane = identity - on_plane
-    line_weights = np.array([np.trace(on_plane @ matrix) for matrix in matrices])
-    plane_weights = np.array([np.trace(plane @ matrix) / 2.0 for matrix in matrices])
+    nilpotent = (generic - double_eigenvalue * identity) @ (
+        generic - single_eigenvalue * identity
+    )  # a multiple of the shear
+    line_projector = (
+        np.linalg.matrix_power(generic - double_eigenvalue * identity, 2) / (single_eigenvalue - double_eigenvalue) ** 2
+    )  # projects on the line
+    plane_projector = identity - line_projector
+    line_weights = np.array([np.trace(line_projector @ matrix) for matrix in matrices])
+    plane_weights = np.array([np.trace(plane_projector @ matrix) / 2.0 for matrix in matrices])
     shear = np.array(
         [
-            np.sum(nilpotent * (matrix @ plane - weight * plane)) / np.sum(nilpotent**2)
+            np.sum(nilpotent * (matrix @ plane_projector - weight * plane_projector)) / np.sum(nilpotent**2)
             for matrix, weight in zip(matrices, plane_weights, strict=True)
         ]
     )
     conditions = np.array([shear / np.abs(shear).max(), plane_weights])
     if abs(np.linalg.det(conditions)) < 1e-7:
-        raise UnclearError("the shear and the dilation of a plane are nearly dependent")
+        raise AmbiguousRoundingError("the shear and the dilation of a plane are nearly dependent")
     a = line_weights @ np.linalg.solve(conditions, [0.0, 1.0])
     return _make_summand("A5,34", a=ratio_or_zero(float(a), 1.0))

@@ -73,6 +73,7 @@ def _coprime_integers(residues: list[int], modulus: int) -> list[int]:
 
 
 def _annihilates(matrix: np.ndarray, vector: list[int]) -> bool:
+    """Return True if ``matrix @ vector`` is zero, in exact integers."""
     max_product = int(np.abs(matrix).max(initial=0)) * sum(map(abs, vector))
     dtype = np.int64 if max_product < 2**63 else object
     return not (matrix.astype(dtype) @ np.array(vector, dtype=dtype)).any()
@@ -139,6 +140,7 @@ def row_echelon(rows: np.ndarray, modulus: int = 0, tolerance: float = 0) -> tup
 
 
 def reduce_modulo(values: np.ndarray, modulus: int) -> np.ndarray:
+    """Return integers modulo ``modulus``; unchanged values if it is 0."""
     return values % modulus if modulus else values
 
 
@@ -152,10 +154,12 @@ def large_prime(k: int) -> int:
 
 
 def is_exact(rows: np.ndarray) -> bool:
+    """Return True if the entries are Python integers or fractions, and False if they are floats."""
     return rows.dtype == object
 
 
 def identity_rows(dim: int, exact: bool) -> np.ndarray:
+    """Return the rows of the identity matrix, shape (dim, dim), as Python integers or as floats."""
     return np.eye(dim, dtype=np.int64).astype(object) if exact else np.eye(dim)
 
 
@@ -165,7 +169,7 @@ def null_space(matrix: np.ndarray, name: str) -> np.ndarray:
     if n == 0 or not len(matrix):
         return identity_rows(n, is_exact(matrix))
     if is_exact(matrix):
-        vectors = rational_null_space(_small_integers(integer_rows(matrix)))
+        vectors = rational_null_space(_to_int64_if_possible(integer_rows(matrix)))
         return np.array(vectors, dtype=object).reshape(-1, n)
     triangle = np.linalg.qr(matrix, mode="r")
     _, singular_values, right_vectors = np.linalg.svd(triangle)
@@ -182,20 +186,20 @@ def row_space(rows: np.ndarray, name: str) -> np.ndarray:
     return right_vectors[: numerical_rank(singular_values, 1.0, name)]
 
 
-def intersection(first: np.ndarray, second: np.ndarray, name: str) -> np.ndarray:
+def intersection(rows_a: np.ndarray, rows_b: np.ndarray, name: str) -> np.ndarray:
     """Return rows that span the intersection of two row spaces."""
-    return null_space(np.vstack([null_space(first, name), null_space(second, name)]), name)
+    return null_space(np.vstack([null_space(rows_a, name), null_space(rows_b, name)]), name)
 
 
-def complement(rows: np.ndarray, within: np.ndarray, name: str) -> np.ndarray:
-    """Return rows of the span of ``within`` that span a complement of ``rows`` there: some of ``within``, or normal."""
+def complement(rows: np.ndarray, space_rows: np.ndarray, name: str) -> np.ndarray:
+    """Return rows that span a complement of ``rows`` in the span of ``space_rows``: some of these, or orthogonal."""
     if not is_exact(rows):
-        projected_rows = within - within @ row_space(rows, name).T @ row_space(rows, name)
+        projected_rows = space_rows - space_rows @ row_space(rows, name).T @ row_space(rows, name)
         return row_space(projected_rows, name)
     n_rows = len(rows)
-    stacked = fraction_rows(np.vstack([rows, within]))
+    stacked = fraction_rows(np.vstack([rows, space_rows]))
     _, independent = row_echelon(stacked.T)
-    return within[[i - n_rows for i in independent if i >= n_rows]]
+    return space_rows[[i - n_rows for i in independent if i >= n_rows]]
 
 
 def coordinates(basis: np.ndarray, vectors: np.ndarray) -> np.ndarray:
@@ -209,7 +213,7 @@ def coordinates(basis: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 
 def solution(matrix: np.ndarray, right_hand_side: np.ndarray) -> np.ndarray:
-    """Return one solution v, shape (n,), of the consistent equations ``matrix @ v = right_hand_side``."""
+    """Return one solution v, shape (n,), of the consistent linear equations ``matrix @ v = right_hand_side``."""
     if not is_exact(matrix):
         return np.linalg.lstsq(matrix, right_hand_side, rcond=None)[0]
     if not matrix.shape[1]:
@@ -219,10 +223,10 @@ def solution(matrix: np.ndarray, right_hand_side: np.ndarray) -> np.ndarray:
     return np.array([Fraction(entry, vector[-1]) for entry in vector[:-1]], dtype=object)
 
 
-def products(left: np.ndarray, right: np.ndarray, constants: np.ndarray) -> np.ndarray:
-    """Return the brackets of all pairs of rows, shape (len(left), len(right), dim)."""
-    images = np.tensordot(left, constants, axes=(1, 0))
-    return np.tensordot(images, right, axes=(1, 1)).transpose(0, 2, 1)
+def brackets_of_rows(rows_a: np.ndarray, rows_b: np.ndarray, constants: np.ndarray) -> np.ndarray:
+    """Return the brackets of all pairs of rows, shape (len(rows_a), len(rows_b), dim)."""
+    ad_matrices = np.tensordot(rows_a, constants, axes=(1, 0))
+    return np.tensordot(ad_matrices, rows_b, axes=(1, 1)).transpose(0, 2, 1)
 
 
 def fraction_rows(rows: np.ndarray) -> np.ndarray:
@@ -243,6 +247,6 @@ def integer_rows(rows: np.ndarray) -> np.ndarray:
     return result
 
 
-def _small_integers(rows: np.ndarray) -> np.ndarray:
+def _to_int64_if_possible(rows: np.ndarray) -> np.ndarray:
     """Return integers as int64 where they fit, for which elimination modulo a prime is fast."""
     return rows.astype(np.int64) if max(map(abs, rows.flat), default=0) < 2**62 else rows

@@ -192,7 +192,7 @@ def balance_constants(constants: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             break
         mask = new_mask  # constants that stand out from rounding only after scaling take part from then on
         logarithms = np.log(magnitudes, where=mask, out=np.zeros(magnitudes.shape))
-        x, *_ = np.linalg.lstsq(_normal_matrix(mask), -_normal_right_hand_side(logarithms), rcond=1e-10)
+        x, *_ = np.linalg.lstsq(_balance_normal_matrix(mask), -_balance_right_hand_side(logarithms), rcond=1e-10)
         exponents = x[:, None, None] + x[:, None] - x
         max_exponent = (logarithms + exponents)[mask].max()
         x, exponents = x - max_exponent, exponents - max_exponent
@@ -200,12 +200,15 @@ def balance_constants(constants: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return scaled_constants, np.exp(x)
 
 
-def _normal_right_hand_side(values: np.ndarray) -> np.ndarray:
-    """Return the right-hand side of the normal equations of the scaling, shape (dim,), from ``values``."""
-    return values.sum(axis=(1, 2)) + values.sum(axis=(0, 2)) - values.sum(axis=(0, 1))
+def _balance_right_hand_side(logarithms: np.ndarray) -> np.ndarray:
+    """Return the right-hand side, shape (dim,), of the normal equations of :func:`balance_constants`."""
+    return logarithms.sum(axis=(1, 2)) + logarithms.sum(axis=(0, 2)) - logarithms.sum(axis=(0, 1))
 
 
-def _normal_matrix(mask: np.ndarray) -> np.ndarray:
-    """Return the matrix of the normal equations of the scaling, shape (dim, dim), for entries in ``mask``."""
+def _balance_normal_matrix(mask: np.ndarray) -> np.ndarray:
+    """Return the matrix, shape (dim, dim), of the normal equations of :func:`balance_constants`.
+
+    ``mask`` is True for the constants that take part.
+    """
     pair_counts = mask.sum(axis=2) - mask.sum(axis=1) - mask.sum(axis=0)  # of a and b, of a and c, of b and c
     return pair_counts + pair_counts.T + np.diag(mask.sum(axis=(1, 2)) + mask.sum(axis=(0, 2)) + mask.sum(axis=(0, 1)))

@@ -124,11 +124,11 @@ class DirectSum(BracketAlgebra):
 
     def bracket(self, x, y) -> jax.Array:
         """Return the Lie bracket ``[x, y]``; elements and result have shape (..., dim) or ``(..., *sites, d)``."""
-        return self._blockwise("_batched_bracket", (x, "x"), (y, "y"))
+        return self._apply_to_blocks("_batched_bracket", (x, "x"), (y, "y"))
 
     def ad_star(self, x, mu) -> jax.Array:
         """Return the coadjoint operator ``ad*_x mu``; elements have shape (..., dim) or ``(..., *sites, d)``."""
-        return self._blockwise("_batched_ad_star", (x, "x"), (mu, "mu"))
+        return self._apply_to_blocks("_batched_ad_star", (x, "x"), (mu, "mu"))
 
     def action(self, x) -> BlockAction:
         return BlockAction(self, x)
@@ -148,7 +148,11 @@ class DirectSum(BracketAlgebra):
             start = stop
         return components
 
-    def _blockwise(self, method_name: str, *named_elements) -> jax.Array:
+    def _apply_to_blocks(self, method_name: str, *named_elements) -> jax.Array:
+        """Call a method of each block's algebra on its components of the elements, and join the results.
+
+        ``named_elements`` are pairs of an element and its label for messages.
+        """
         has_site_axes = any(self._flatten_element(x, what)[1] for x, what in named_elements)
         argument_blocks = zip(*(self.split(x, what) for x, what in named_elements), strict=True)
         results = [getattr(g, method_name)(*parts) for (g, _), parts in zip(self.blocks, argument_blocks, strict=True)]
@@ -156,20 +160,20 @@ class DirectSum(BracketAlgebra):
         components = rows[0] if len(rows) == 1 else jnp.concatenate(rows, axis=-1)
         return components.reshape(*components.shape[:-1], *self.shape) if has_site_axes else components
 
-    def _flatten_element(self, x, what: str) -> tuple[jax.Array, bool]:
+    def _flatten_element(self, x, label: str) -> tuple[jax.Array, bool]:
         """Return an element of shape (..., dim), and True if it came with axes for the sites."""
-        array = jnp.asarray(numeric_array(x, what))
+        array = jnp.asarray(numeric_array(x, label))
         if self.sites is not None and array.shape[-len(self.shape) :] == self.shape:
             array = array.reshape(*array.shape[: -len(self.shape)], self.dim)
-            return real_components(array, self.dim, what), True
+            return real_components(array, self.dim, label), True
         if self.sites is not None and array.shape[-1:] != (self.dim,):
             raise ShapeError(
-                f"{what} must have shape (..., {_axes_text(self.shape)}) or (..., {self.dim}), got {array.shape}"
+                f"{label} must have shape (..., {_axes_text(self.shape)}) or (..., {self.dim}), got {array.shape}"
             )
-        return real_components(array, self.dim, what), False
+        return real_components(array, self.dim, label), False
 
-    def _element(self, x, what: str) -> jax.Array:
-        return self._flatten_element(x, what)[0]
+    def _element(self, x, label: str) -> jax.Array:
+        return self._flatten_element(x, label)[0]
 
     def _batched_bracket(self, x, y) -> jax.Array:
         return self.bracket(x, y)
@@ -203,10 +207,10 @@ class DirectSum(BracketAlgebra):
         return all(g.is_unimodular() for g, _ in self.blocks)
 
     def derived_series(self) -> list[int]:
-        return _sum_series([(g.derived_series(), count) for g, count in self.blocks])
+        return _sum_dimension_series([(g.derived_series(), count) for g, count in self.blocks])
 
     def lower_central_series(self) -> list[int]:
-        return _sum_series([(g.lower_central_series(), count) for g, count in self.blocks])
+        return _sum_dimension_series([(g.lower_central_series(), count) for g, count in self.blocks])
 
     # -- Casimirs -----------------------------------------------------------------------------------------------------
 
@@ -359,6 +363,7 @@ class BlockCasimir:
 
 
 def _embed_casimir(casimir, start: int, size: int, dim: int) -> Polynomial | BlockCasimir:
+    """Return a Casimir of a summand as a function of all ``dim`` components; the summand begins at ``start``."""
     if not isinstance(casimir, Polynomial):
         return BlockCasimir(casimir, start, size, dim)
     exponents = np.zeros((len(casimir.terms), dim), dtype=np.int64)
@@ -395,7 +400,7 @@ def direct_sum_by_constants(algebras: Sequence[LieAlgebra]) -> LieAlgebra:
         for g, start in zip(algebras, starts, strict=False)
         for F in g.invariants
     ]
-    return total._carry_invariants(invariants) if invariants else total
+    return total._with_unchecked_invariants(invariants) if invariants else total
 
 
 def joined_basis_names(*algebras: LieAlgebra) -> tuple[str, ...] | None:
@@ -404,15 +409,15 @@ def joined_basis_names(*algebras: LieAlgebra) -> tuple[str, ...] | None:
     return tuple(names) if len(set(names)) == sum(g.dim for g in algebras) else None
 
 
-def _sum_series(series: list[tuple[list[int], int]]) -> list[int]:
-    """Add up series of dimensions, each times its count; a series that has ended continues with its last value."""
-    n_terms = max(len(dims) for dims, _ in series)
-    return [sum(count * dims[min(i, len(dims) - 1)] for dims, count in series) for i in range(n_terms)]
+def _sum_dimension_series(dims_and_counts: list[tuple[list[int], int]]) -> list[int]:
+    """Return the sum of series of dimensions, each times its count; a shorter series continues with its last value."""
+    n_terms = max(len(dims) for dims, _ in dims_and_counts)
+    return [sum(count * dims[min(i, len(dims) - 1)] for dims, count in dims_and_counts) for i in range(n_terms)]
 
 
 def _block_diagonal(stacks: list[jax.Array]) -> jax.Array:
     """Return block-diagonal matrices, shape (..., n, n), from stacks of shape (..., count, d, d)."""
-    size = sum(part.shape[-3] * part.shape[-1] for part in stacks)
+    size = sum(stack.shape[-3] * stack.shape[-1] for stack in stacks)
     matrix, start = jnp.zeros((*stacks[0].shape[:-3], size, size)), 0
     for stack in stacks:
         count, d = stack.shape[-3], stack.shape[-1]

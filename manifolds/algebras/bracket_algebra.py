@@ -55,9 +55,9 @@ class BracketAlgebra(LieAlgebra):
     basis = forward_to("algebra_by_constants")
     _balanced_constants_and_factors = forward_to("algebra_by_constants")
 
-    def _check_matrix_memory(self, what: str) -> None:
+    def _check_matrix_memory(self, label: str) -> None:
         """Raise SizeError if a dim by dim matrix would not fit into memory."""
-        check_memory(float(self.dim) ** 2, f"{what} of {self.name}", "bracket, ad_star and action make no matrices")
+        check_memory(float(self.dim) ** 2, f"{label} of {self.name}", "bracket, ad_star and action make no matrices")
 
     def ad(self, x):
         self._check_matrix_memory("the matrix of ad")

@@ -52,7 +52,7 @@ def _checked_table(brackets: Mapping) -> dict[tuple[str, str], Combination]:
         if not isinstance(pair, tuple) or len(pair) != 2 or not all(isinstance(name, str) for name in pair):
             raise ParameterError(f"a bracket needs a pair of names such as ('e1', 'e2'), got {pair!r}")
         first, second = pair
-        combination = _combination(value, pair)
+        combination = _parse_combination(value, pair)
         if first == second and combination:
             raise AntisymmetryError(f"[{first}, {first}] must be zero, got {value!r}. Remove this entry")
         opposite = table.get((second, first))
@@ -66,8 +66,8 @@ def _checked_table(brackets: Mapping) -> dict[tuple[str, str], Combination]:
     return table
 
 
-def _combination(value, pair: tuple[str, str]) -> Combination:
-    """Return the value of a bracket, a name or a dictionary or 0, without its zero coefficients."""
+def _parse_combination(value, pair: tuple[str, str]) -> Combination:
+    """Return the coefficients, by name, of a bracket that is given as a name, a dictionary or 0; zeros are dropped."""
     if isinstance(value, str):
         if not value.removeprefix("-").strip().isidentifier():
             raise ComponentError(

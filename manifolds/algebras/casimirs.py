@@ -178,26 +178,26 @@ def _matrix_power(X, exponent: int):
 @lru_cache(maxsize=64)
 def fundamental_invariants(g: AlgebraStructure) -> tuple[TracePolynomial | Polynomial, ...] | None:
     """Return Casimirs that generate all polynomial ones, by increasing degree; None if no such set is found."""
-    sources: list[_EquivariantSource] = []
-    for source in _equivariant_sources(g):
-        sources.append(source)
-        generators = _complete_invariants(g, sources)
+    families: list[_EquivariantFamily] = []
+    for family in _equivariant_families(g):
+        families.append(family)
+        generators = _complete_invariants(g, families)
         if generators is not None:
             return generators
     return None
 
 
 def _complete_invariants(
-    g: AlgebraStructure, sources: list[_EquivariantSource]
+    g: AlgebraStructure, families: list[_EquivariantFamily]
 ) -> tuple[TracePolynomial | Polynomial, ...] | None:
-    """Return independent invariants of the sources, if they are complete by number and degrees; else None."""
+    """Return independent invariants of the families, if they are complete by number and degrees; else None."""
     count = casimir_count(g)
     degree_sum = (g.dim + count) // 2
     points = np.random.default_rng(0).standard_normal((3, g.dim))
     generators: list[TracePolynomial | Polynomial] = []
     spans = [np.zeros((0, g.dim)) for _ in points]
     for degree in range(1, degree_sum + 1):
-        for F in (F for source in sources for F in source.invariants(degree)):
+        for F in (F for family in families for F in family.invariants(degree)):
             gradients = [_gradient_at(F, mu) for mu in points]
             if not all(_is_invariant(g, row, mu) for row, mu in zip(gradients, points, strict=True)):
                 return None  # an algebra whose constants are too inaccurate
@@ -212,10 +212,12 @@ def _complete_invariants(
 
 
 def _gradient_at(F: TracePolynomial | Polynomial, mu: np.ndarray) -> np.ndarray:
+    """Return the gradient of an invariant at mu, shape (dim,)."""
     return F._gradient(mu) if isinstance(F, TracePolynomial) else np.asarray(jax.grad(F)(mu))
 
 
 def _is_invariant(g: AlgebraStructure, gradient: np.ndarray, mu: np.ndarray) -> bool:
+    """Return True if ``ad*_gradient mu`` vanishes to rounding, as for the gradient of a Casimir at mu."""
     motion = np.einsum("abc,a,c->b", g.structure_constants, gradient, mu)
     scale = np.abs(g.structure_constants).max() * np.linalg.norm(gradient) * np.linalg.norm(mu)
     return bool(np.linalg.norm(motion) <= 1e-10 * scale)
@@ -229,7 +231,7 @@ def _extend_span(span: np.ndarray, row: np.ndarray) -> np.ndarray:
     return np.vstack([span, remainder / norm]) if norm > MIN_INDEPENDENCE_SINE * np.linalg.norm(row) else span
 
 
-class _EquivariantSource(NamedTuple):
+class _EquivariantFamily(NamedTuple):
     """Equivariant matrices X_a, the matrices that commute with all of them, and the Pfaffian or None."""
 
     name: str
@@ -245,25 +247,28 @@ class _EquivariantSource(NamedTuple):
             yield self.pfaffian
 
 
-def _equivariant_sources(g: AlgebraStructure) -> Iterator[_EquivariantSource]:
-    """Yield sources by increasing cost: matrices of the algebra, adjoint matrices, second derivatives of cubic
-    Casimirs."""
+def _equivariant_families(g: AlgebraStructure) -> Iterator[_EquivariantFamily]:
+    """Yield equivariant families of matrices by increasing cost.
+
+    They are the matrices of the algebra, the adjoint matrices, and the second derivatives of cubic Casimirs.
+    """
     if g.basis is not None:
         basis = _real_matrices(g.basis)
         X = _dual_matrices(basis)
         if X is not None:
-            yield _EquivariantSource("X", X, _commutant(X, g.name), _pfaffian(basis, X, g.name))
+            yield _EquivariantFamily("X", X, _commutant(X, g.name), _pfaffian(basis, X, g.name))
     if not g.is_semisimple():
         return
     ad = g.structure_constants.swapaxes(1, 2)
     X = np.einsum("ab,bij->aij", np.linalg.inv(g.killing_form()), ad)
-    yield _EquivariantSource("ad(X)", X, _commutant(X, g.name))
+    yield _EquivariantFamily("ad(X)", X, _commutant(X, g.name))
     for i, cubic in enumerate(_cubic_casimirs(g)):
         D = _third_derivatives(cubic) @ g.killing_form()  # from g to g* to g
-        yield _EquivariantSource(f"D{i + 1}", D, [np.eye(g.dim)])
+        yield _EquivariantFamily(f"D{i + 1}", D, [np.eye(g.dim)])
 
 
 def _cubic_casimirs(g: AlgebraStructure) -> list[Polynomial]:
+    """Return the Casimirs of degree 3; none if they are too costly or unclear."""
     try:
         return list(new_casimirs(g, 3))
     except LieAlgebraError:  # too many monomials, or no clear rank
@@ -271,6 +276,7 @@ def _cubic_casimirs(g: AlgebraStructure) -> list[Polynomial]:
 
 
 def _third_derivatives(cubic: Polynomial) -> np.ndarray:
+    """Return the third derivatives of a cubic polynomial, shape (dim, dim, dim)."""
     derivatives = np.zeros((cubic.dim,) * 3)
     for power, coefficient in cubic.terms:
         value = float(coefficient) * math.prod(math.factorial(e) for e in power)

@@ -16,7 +16,7 @@ import numpy as np
 from ..errors import LieAlgebraError
 from . import _solvable_types as solvable
 from ._solvable_types import Summand, distinct_eigenvalues
-from ._subspaces import complement, coordinates, intersection, is_exact, null_space, products, row_space
+from ._subspaces import brackets_of_rows, complement, coordinates, intersection, is_exact, null_space, row_space
 from .blocks import direct_sum
 from .lie_algebra import LieAlgebra
 from .patera import CATALOGUE, patera
@@ -63,12 +63,12 @@ class IsomorphismType:
         """The names of all summands, such as ``"A4,9^b"`` or ``"A3,1 + 2 A1"``; ``"unknown"`` if they are not known."""
         if not self.is_known:
             return "unknown"
-        return " + ".join(self._counted_texts(lambda summand: _family_name(summand)))
+        return " + ".join(self._texts_with_counts(lambda summand: _family_name(summand)))
 
     @property
     def decomposition(self) -> str:
         """The summands with the values of their parameters, such as ``"A3,5^a (a=0.5) + A1"``."""
-        return " + ".join(self._counted_texts(_text)) if self.is_known else "unknown"
+        return " + ".join(self._texts_with_counts(_summand_text)) if self.is_known else "unknown"
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -88,7 +88,8 @@ class IsomorphismType:
         algebras = [patera(name, **dict(pairs)) for name, pairs in self.summands]
         return algebras[0] if len(algebras) == 1 else direct_sum(*algebras)
 
-    def _counted_texts(self, text_of: Callable[[Summand], str]) -> list[str]:
+    def _texts_with_counts(self, text_of: Callable[[Summand], str]) -> list[str]:
+        """Return the text of each different summand, with the number of its copies in front if it is above 1."""
         counts = Counter(text_of(summand) for summand in self.summands)
         return [text if count == 1 else f"{count} {text}" for text, count in counts.items()]
 
@@ -97,11 +98,13 @@ class IsomorphismType:
 
 
 def _family_name(summand: Summand) -> str:
+    """Return the name of a summand with the names of its parameters, such as ``"A3,5^a"``."""
     name, pairs = summand
     return name + ("^" + ",".join(parameter for parameter, _ in pairs) if pairs else "")
 
 
-def _text(summand: Summand) -> str:
+def _summand_text(summand: Summand) -> str:
+    """Return the name of a summand with the values of its parameters, such as ``"A3,5^a (a=0.5)"``."""
     values = ", ".join(f"{parameter}={value:g}" for parameter, value in summand[1])
     return _family_name(summand) + (f" ({values})" if values else "")
 
@@ -110,7 +113,7 @@ def isomorphism_type(g: LieAlgebra) -> IsomorphismType:
     """Return the isomorphism type of an algebra; see :meth:`manifolds.LieAlgebra.isomorphism_type`."""
     work = working_constants(g)
     try:
-        summands = [_indecomposable_type(part) for part in _indecomposable_parts(work)]
+        summands = [_indecomposable_type(summand) for summand in _indecomposable_summands(work)]
     except LieAlgebraError as error:
         return IsomorphismType((), str(error))
     order = {name: i for i, name in enumerate(CATALOGUE)}
@@ -119,7 +122,7 @@ def isomorphism_type(g: LieAlgebra) -> IsomorphismType:
 
 def _restrict_to_rows(work: WorkingConstants, rows: np.ndarray) -> WorkingConstants:
     """Return the constants of a subalgebra in the basis of independent rows."""
-    brackets = products(rows, rows, work.constants).reshape(-1, work.dim)
+    brackets = brackets_of_rows(rows, rows, work.constants).reshape(-1, work.dim)
     constants = coordinates(rows, brackets).reshape((len(rows),) * 3) if len(rows) else np.zeros((0, 0, 0))
     if not is_exact(constants):
         constants = np.where(np.abs(constants) < CONSTANT_ROUNDING, 0.0, constants)
@@ -127,23 +130,23 @@ def _restrict_to_rows(work: WorkingConstants, rows: np.ndarray) -> WorkingConsta
     return WorkingConstants(constants, np.ones(len(rows)), work.name)
 
 
-def _indecomposable_parts(work: WorkingConstants) -> list[WorkingConstants]:
+def _indecomposable_summands(work: WorkingConstants) -> list[WorkingConstants]:
     """Return the indecomposable summands of an algebra."""
-    central, derived = centre(work), derived_ideals(work)
-    brackets = derived[1] if len(derived) > 1 else derived[0]
+    central, derived_series = centre(work), derived_ideals(work)
+    brackets = derived_series[1] if len(derived_series) > 1 else derived_series[0]
     abelian = complement(intersection(central, brackets, work.name), central, work.name)
     lines = [_restrict_to_rows(work, row[None]) for row in abelian]
     if len(abelian) == work.dim:
         return lines
     if len(abelian):
-        both = row_space(np.vstack([brackets, abelian]), work.name)
-        rest = complement(both, work.whole_space, work.name)
-        work = _restrict_to_rows(work, row_space(np.vstack([brackets, rest]), work.name))
-    return _parts_by_centroid(work) + lines
+        derived_and_abelian = row_space(np.vstack([brackets, abelian]), work.name)
+        complement_rows = complement(derived_and_abelian, work.full_space_rows, work.name)
+        work = _restrict_to_rows(work, row_space(np.vstack([brackets, complement_rows]), work.name))
+    return _split_by_centroid(work) + lines
 
 
-def _parts_by_centroid(work: WorkingConstants) -> list[WorkingConstants]:
-    """Return the summands of an algebra without abelian summands, by a generic element of its centroid.
+def _split_by_centroid(work: WorkingConstants) -> list[WorkingConstants]:
+    """Split an algebra without abelian summands into indecomposable ones, by a generic element of its centroid.
 
     The centroid consists of the linear maps with ``phi [x, y] = [phi x, y]``.
     """
@@ -166,14 +169,14 @@ def _parts_by_centroid(work: WorkingConstants) -> list[WorkingConstants]:
     if len(eigenvalues) == 1:
         return [work]
     values = phi.astype(np.float64)
-    scale, parts = float(np.abs(values).max()), []
+    scale, summands = float(np.abs(values).max()), []
     float_work = WorkingConstants(C.astype(np.float64) / float(np.abs(C).max()), np.ones(n), work.name)
     for eigenvalue, multiplicity in eigenvalues:
         factor = (values - eigenvalue * np.eye(n)) / scale
         real_factor = factor.real if eigenvalue.imag == 0.0 else (factor @ factor.conj()).real
         rows = null_space(np.linalg.matrix_power(real_factor, multiplicity), work.name)
-        parts += _parts_by_centroid(_restrict_to_rows(float_work, rows))
-    return parts
+        summands += _split_by_centroid(_restrict_to_rows(float_work, rows))
+    return summands
 
 
 def _indecomposable_type(work: WorkingConstants) -> Summand:
@@ -183,7 +186,7 @@ def _indecomposable_type(work: WorkingConstants) -> Summand:
         raise LieAlgebraError(f"{work.name} has an indecomposable summand of dimension {n}, above {MAX_TYPE_DIM}")
     solvable_ideal = radical(work)
     if len(solvable_ideal) < n:
-        return _unsolvable_type(work, len(solvable_ideal))
+        return _nonsolvable_type(work, len(solvable_ideal))
     if n <= 2:
         return (f"A{n}", ())
     nil = nilradical(work)
@@ -192,7 +195,8 @@ def _indecomposable_type(work: WorkingConstants) -> Summand:
     return solvable.solvable_type(work, nil)
 
 
-def _unsolvable_type(work: WorkingConstants, radical_dim: int) -> Summand:
+def _nonsolvable_type(work: WorkingConstants, radical_dim: int) -> Summand:
+    """Return the type of an indecomposable algebra with a Levi subalgebra; LieAlgebraError if it has no name."""
     if work.dim == 5 and radical_dim == 2:
         return ("A5,40", ())
     if work.dim != 3:
@@ -203,6 +207,7 @@ def _unsolvable_type(work: WorkingConstants, radical_dim: int) -> Summand:
 
 
 def _nilpotent_type(work: WorkingConstants) -> Summand:
+    """Return the type of an indecomposable nilpotent algebra; LieAlgebraError if it has no name."""
     ideals = lower_central_ideals(work)
     dims = tuple(len(ideal) for ideal in ideals)
     names = {(3, 1, 0): "A3,1", (4, 2, 1, 0): "A4,1", (5, 2, 0): "A5,1", (5, 3, 2, 0): "A5,3", (5, 1, 0): "A5,4"}

@@ -201,9 +201,10 @@ class LieAlgebra(StructureMethods):
         """
         for function in functions:
             check_invariant(self, function)
-        return self._carry_invariants(functions)
+        return self._with_unchecked_invariants(functions)
 
-    def _carry_invariants(self, functions: Iterable[Callable]) -> LieAlgebra:
+    def _with_unchecked_invariants(self, functions: Iterable[Callable]) -> LieAlgebra:
+        """Return a copy with further invariants, which are not tested."""
         algebra = copy(self)
         algebra.__dict__.pop("_key", None)
         algebra.invariants = (*self.invariants, *functions)
@@ -259,7 +260,7 @@ class LieAlgebra(StructureMethods):
         rows = tuple(map(tuple, inverse.astype(np.float64).tolist()))
         basis = None if self.basis is None else np.tensordot(np.asarray(P, dtype=np.float64), self.basis, axes=(1, 0))
         algebra = LieAlgebra(constants, name=name or self.name, basis=basis, basis_names=basis_names)
-        return algebra._carry_invariants(CasimirInBasis(F, rows) for F in self.invariants)
+        return algebra._with_unchecked_invariants(CasimirInBasis(F, rows) for F in self.invariants)
 
     # -- the operations -----------------------------------------------------------------------------------------
 
@@ -497,10 +498,12 @@ class LieAlgebra(StructureMethods):
         basis = () if self.basis is None else (self.basis.shape, self.basis.tobytes())
         return self.dim, self.structure_constants.tobytes(), basis, self.invariants
 
-    def _element(self, x, what: str) -> jax.Array:
-        return real_components(x, self.dim, what)
+    def _element(self, x, label: str) -> jax.Array:
+        """Return the components of an element as an array, shape (..., dim), after a check of shape and type."""
+        return real_components(x, self.dim, label)
 
     def _require_basis(self) -> np.ndarray:
+        """Return the matrices of the basis; raise LieAlgebraError if the algebra has none."""
         if self.basis is None:
             raise LieAlgebraError(
                 f"{self.name} was defined by structure constants and has no matrices; build it with "
@@ -533,6 +536,10 @@ class LieAlgebra(StructureMethods):
         return _read_only_copy(rounded_theta if np.abs(rounded_theta - theta).max() < 1e-10 else theta)
 
     def _ideal_series_dims(self, factors_of_ideal: Callable) -> list[int]:
+        """Return the dimensions of a series of ideals until they no longer fall.
+
+        ``factors_of_ideal`` maps rows that span an ideal to the two spans whose brackets span the next one.
+        """
         ideal, dims = np.eye(self.dim), [self.dim]
         while True:
             left_factor, right_factor = factors_of_ideal(ideal)

@@ -146,6 +146,7 @@ class MagneticExtension(BracketAlgebra):
         return self._extended_casimirs(self.algebra.leading_casimirs()[:MAX_FOLLOWED_CASIMIRS])
 
     def _extended_casimirs(self, base_casimirs: list[tuple[str, Callable]]) -> list[tuple[str, Callable]]:
+        """Return the two Casimirs of the extension, with their names, that follow from each Casimir of g."""
         kinds = (("of B", FieldCasimir), ("along W at B", MomentumFieldCasimir))
         return [
             (f"{name} {argument_text}", casimir_class(self, f))
@@ -201,6 +202,7 @@ def invariant_form_map(g: LieAlgebra) -> Callable | None:
 
 
 def _apply_forms_blockwise(g: DirectSum, forms, x) -> jax.Array:
+    """Apply the form of each block of a direct sum to its components of x; return the covector, shape (..., dim)."""
     covectors = [form(component) for form, component in zip(forms, g.split(x), strict=True)]
     return jnp.concatenate([component.reshape(*component.shape[:-2], -1) for component in covectors], axis=-1)
 
@@ -257,6 +259,7 @@ class MomentumFieldCasimir(FieldCasimir):
 
 
 def _dual_of_field(extension: MagneticExtension, B) -> jax.Array:
+    """Return the dual vector of the field B by the invariant form of g, shape (..., dim of g)."""
     form = invariant_form_map(extension.algebra)
     assert form is not None
     return form(B)

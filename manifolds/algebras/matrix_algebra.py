@@ -107,11 +107,11 @@ class MatrixAlgebra(BracketAlgebra):
 
         For anti-Hermitian matrices ``[X, Y] = X Y - (X Y)^H``, and the two terms have equal products with each e_a.
         """
-        products = self.matrix_basis.inner_products(_product(X, Y))
+        products = self.matrix_basis.inner_products(_multiply_parts(X, Y))
         return (
             2.0 * products
             if self.classical_data.is_compact
-            else products - self.matrix_basis.inner_products(_product(Y, X))
+            else products - self.matrix_basis.inner_products(_multiply_parts(Y, X))
         )
 
     def _components(self, X: MatrixParts) -> jax.Array:
@@ -340,7 +340,7 @@ def _trace_of_power_times_jvp(n: int, hermitian: bool, primals, tangents):
     for i in range(n if not hermitian else (n + 1) // 2):
         multiplicity = 2.0 if hermitian and 2 * i != n - 1 else 1.0
         derivative = derivative + multiplicity * _real_trace_of_product(
-            _product(_product(_matrix_power(M, n - 1 - i), D), _matrix_power(M, i)), dM
+            _multiply_parts(_multiply_parts(_matrix_power(M, n - 1 - i), D), _matrix_power(M, i)), dM
         )
     return _trace_of_power_times(n, hermitian, M, D), derivative
 
@@ -350,7 +350,7 @@ def _matrix_power(M: MatrixParts, n: int) -> MatrixParts:
     if n <= 1:
         return M if n else ()
     half = _matrix_power(M, n // 2)
-    return _product(_product(half, half), M if n % 2 else ())
+    return _multiply_parts(_multiply_parts(half, half), M if n % 2 else ())
 
 
 def _real_trace_of_product(X: MatrixParts, Y: MatrixParts) -> jax.Array:
@@ -361,7 +361,8 @@ def _real_trace_of_product(X: MatrixParts, Y: MatrixParts) -> jax.Array:
     return traces[0] - sum(traces[1:])
 
 
-def _product(X: MatrixParts, Y: MatrixParts) -> MatrixParts:
+def _multiply_parts(X: MatrixParts, Y: MatrixParts) -> MatrixParts:
+    """Return the product X Y in real and imaginary parts; the empty tuple stands for 1."""
     if not (X and Y):
         return X or Y
     if len(X) == 1:
@@ -372,8 +373,10 @@ def _product(X: MatrixParts, Y: MatrixParts) -> MatrixParts:
 
 
 def _conjugate_transpose(X: MatrixParts) -> MatrixParts:
+    """Return ``X^H`` in real and imaginary parts."""
     return tuple(sign * jnp.swapaxes(part, -1, -2) for sign, part in zip((1.0, -1.0), X, strict=False))
 
 
 def _combine_parts(X: MatrixParts) -> jax.Array:
+    """Return a matrix as one array, complex if it has an imaginary part."""
     return X[0] if len(X) == 1 else jax.lax.complex(X[0], X[1])

@@ -22,7 +22,7 @@ IMAGINARY = 1
 
 
 class EntryTable(NamedTuple):
-    """Matrix entries that hold one component times a number, as arrays of equal length.
+    """Sparse table of the matrix entries that are a component times a number, as arrays of equal length.
 
     Attributes
     ----------

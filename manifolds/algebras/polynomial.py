@@ -65,7 +65,7 @@ class Polynomial(metaclass=ListedType):
             raise ComponentError("the exponents of a polynomial must be integers >= 0")
         terms: dict[tuple[int, ...], Coefficient] = {}
         for power, coefficient in zip(map(tuple, powers.tolist()), coefficients, strict=True):
-            terms[power] = terms.get(power, Fraction(0)) + _coefficient(coefficient)
+            terms[power] = terms.get(power, Fraction(0)) + _checked_coefficient(coefficient)
         nonzero = ((power, terms[power]) for power in sorted(terms, reverse=True) if terms[power])
         object.__setattr__(self, "dim", powers.shape[1])
         object.__setattr__(self, "terms", tuple(nonzero))
@@ -170,7 +170,7 @@ class Polynomial(metaclass=ListedType):
 
     def __str__(self) -> str:
         names = component_names(self.names, self.dim)
-        text = " + ".join(_term(power, coefficient, names) for power, coefficient in self.terms)
+        text = " + ".join(_term_text(power, coefficient, names) for power, coefficient in self.terms)
         return text.replace("+ -", "- ") or "0"
 
     def __repr__(self) -> str:
@@ -178,11 +178,12 @@ class Polynomial(metaclass=ListedType):
 
     def _repr_latex_(self) -> str:
         """Return the polynomial in LaTeX, for a notebook."""
-        text = " + ".join(_latex_term(power, coefficient, self.names) for power, coefficient in self.terms)
+        text = " + ".join(_latex_term_text(power, coefficient, self.names) for power, coefficient in self.terms)
         return f"$\\displaystyle {text.replace('+ -', '- ') or '0'}$"
 
 
-def _coefficient(value) -> Coefficient:
+def _checked_coefficient(value) -> Coefficient:
+    """Return a coefficient as a Fraction if it is rational, else as a float; raise ComponentError if it is none."""
     if isinstance(value, Rational):
         return Fraction(int(value.numerator), int(value.denominator))
     if not isinstance(value, Real) or not math.isfinite(value):
@@ -190,17 +191,22 @@ def _coefficient(value) -> Coefficient:
     return float(value)
 
 
-def _term(power: tuple[int, ...], coefficient: Coefficient, names: tuple[str, ...]) -> str:
+def _term_text(exponents: tuple[int, ...], coefficient: Coefficient, names: tuple[str, ...]) -> str:
+    """Return a term of a polynomial as text, such as ``2*mu1**2*mu3``."""
     number = str(coefficient) if isinstance(coefficient, Fraction) else f"{coefficient:.15g}"
-    factors = [name + (f"**{e}" if e > 1 else "") for name, e in zip(names, power, strict=True) if e]
+    factors = [name + (f"**{e}" if e > 1 else "") for name, e in zip(names, exponents, strict=True) if e]
     if factors and number in ("1", "-1"):
         return number[:-1] + "*".join(factors)
     return "*".join([number, *factors])
 
 
-def _latex_term(power: tuple[int, ...], coefficient: Coefficient, names: tuple[str, ...] | None) -> str:
-    letters = [rf"\mu_{{{i + 1}}}" for i in range(len(power))] if names is None else [rf"\mathrm{{{n}}}" for n in names]
-    factors = " ".join(letter + (f"^{{{e}}}" if e > 1 else "") for letter, e in zip(letters, power, strict=True) if e)
+def _latex_term_text(exponents: tuple[int, ...], coefficient: Coefficient, names: tuple[str, ...] | None) -> str:
+    letters = (
+        [rf"\mu_{{{i + 1}}}" for i in range(len(exponents))] if names is None else [rf"\mathrm{{{n}}}" for n in names]
+    )
+    factors = " ".join(
+        letter + (f"^{{{e}}}" if e > 1 else "") for letter, e in zip(letters, exponents, strict=True) if e
+    )
     if isinstance(coefficient, Fraction):
         numerator, denominator = abs(coefficient.numerator), coefficient.denominator
         number = str(numerator) if denominator == 1 else rf"\tfrac{{{numerator}}}{{{denominator}}}"
@@ -311,7 +317,7 @@ MAX_EXPONENT_DENOMINATOR = 1000
 """Largest denominator of an exponent that is written as a ratio of integers."""
 
 
-def is_integer_ratio(value: float) -> tuple[int, int] | None:
+def small_integer_ratio(value: float) -> tuple[int, int] | None:
     """Return (n, m) with ``value = n/m`` to the last digit and m small, or None."""
     for denominator in range(1, MAX_EXPONENT_DENOMINATOR + 1):
         numerator = round(value * denominator)

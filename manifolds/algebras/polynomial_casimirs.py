@@ -118,10 +118,10 @@ def _homogeneous_casimirs(g: AlgebraStructure, degree: int) -> list[Polynomial]:
     return sorted(invariants, key=lambda F: F.terms[0][0], reverse=True)
 
 
-def _check_size(size: int, limit: int, what: str) -> None:
+def _check_size(size: int, limit: int, label: str) -> None:
     if size > limit:
         raise TooLargeError(
-            f"{what}, more than the {limit} that the search for Casimirs allows, and no traces of powers of matrices "
+            f"{label}, more than the {limit} that the search for Casimirs allows, and no traces of powers of matrices "
             "are known to generate them all: ask for a lower degree, or build a reductive algebra from matrices"
         )
 

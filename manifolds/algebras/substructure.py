@@ -13,13 +13,13 @@ import numpy as np
 
 from ..errors import LieAlgebraError
 from ._subspaces import (
+    brackets_of_rows,
     complement,
     coordinates,
     identity_rows,
     integer_rows,
     is_exact,
     null_space,
-    products,
     row_space,
     solution,
 )
@@ -54,12 +54,13 @@ class WorkingConstants:
         return len(self.factors)
 
     @property
-    def whole_space(self) -> np.ndarray:
+    def full_space_rows(self) -> np.ndarray:
+        """Rows of the identity matrix, which span the algebra, shape (dim, dim)."""
         return identity_rows(self.dim, is_exact(self.constants))
 
-    def span_of_brackets(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    def span_of_brackets(self, rows_a: np.ndarray, rows_b: np.ndarray) -> np.ndarray:
         """Return rows that span the brackets of two subspaces."""
-        return row_space(products(left, right, self.constants).reshape(-1, self.dim), self.name)
+        return row_space(brackets_of_rows(rows_a, rows_b, self.constants).reshape(-1, self.dim), self.name)
 
     def ad_matrices(self, rows: np.ndarray) -> np.ndarray:
         """Return the matrices of ad of each row, shape (k, dim, dim)."""
@@ -84,17 +85,17 @@ def working_constants(g: AlgebraStructure) -> WorkingConstants:
 
 def centralizer(work: WorkingConstants, rows: np.ndarray) -> np.ndarray:
     """Return rows x with ``[x, y] = 0`` for every y in a subspace."""
-    images = products(work.whole_space, rows, work.constants)
+    images = brackets_of_rows(work.full_space_rows, rows, work.constants)
     return null_space(images.reshape(work.dim, -1).T, work.name)
 
 
 def centre(work: WorkingConstants) -> np.ndarray:
-    return centralizer(work, work.whole_space)
+    return centralizer(work, work.full_space_rows)
 
 
 def derived_ideals(work: WorkingConstants, ideal: np.ndarray | None = None) -> list[np.ndarray]:
     """Return rows of g, [g, g], [[g, g], [g, g]], … until the dimension no longer falls; or those of an ideal."""
-    ideals = [work.whole_space if ideal is None else ideal]
+    ideals = [work.full_space_rows if ideal is None else ideal]
     while len(ideals[-1]):
         next_ideal = work.span_of_brackets(ideals[-1], ideals[-1])
         if len(next_ideal) == len(ideals[-1]):
@@ -105,7 +106,7 @@ def derived_ideals(work: WorkingConstants, ideal: np.ndarray | None = None) -> l
 
 def lower_central_ideals(work: WorkingConstants, ideal: np.ndarray | None = None) -> list[np.ndarray]:
     """Return rows of g, [g, g], [g, [g, g]], … until the dimension no longer falls; or those of an ideal."""
-    first = work.whole_space if ideal is None else ideal
+    first = work.full_space_rows if ideal is None else ideal
     ideals = [first]
     while len(ideals[-1]):
         next_ideal = work.span_of_brackets(first, ideals[-1])
@@ -118,8 +119,8 @@ def lower_central_ideals(work: WorkingConstants, ideal: np.ndarray | None = None
 def radical(work: WorkingConstants) -> np.ndarray:
     """Return rows of the largest solvable ideal: the complement of [g, g] by the Killing form (Cartan)."""
     killing = np.tensordot(work.constants, work.constants, axes=([1, 2], [2, 1]))
-    derived = work.span_of_brackets(work.whole_space, work.whole_space)
-    return null_space(derived @ killing, work.name) if len(derived) else work.whole_space
+    derived = work.span_of_brackets(work.full_space_rows, work.full_space_rows)
+    return null_space(derived @ killing, work.name) if len(derived) else work.full_space_rows
 
 
 def nilradical(work: WorkingConstants) -> np.ndarray:
@@ -166,21 +167,21 @@ def levi_subalgebra(work: WorkingConstants) -> tuple[np.ndarray, np.ndarray]:
     equations [de Graaf 2000, section 4.13].
     """
     solvable_ideal = radical(work)
-    rows = complement(solvable_ideal, work.whole_space, work.name)
+    rows = complement(solvable_ideal, work.full_space_rows, work.name)
     n = len(rows)
     if n == 0 or not len(solvable_ideal):
         return rows, solvable_ideal
     modulo_radical = null_space(solvable_ideal, work.name)
-    brackets = products(rows, rows, work.constants).reshape(-1, work.dim)
+    brackets = brackets_of_rows(rows, rows, work.constants).reshape(-1, work.dim)
     levi_constants = coordinates(rows @ modulo_radical.T, brackets @ modulo_radical.T).reshape(n, n, n)
     layers = derived_ideals(work, solvable_ideal)
     for layer, next_layer in itertools.pairwise(layers):
-        functionals = null_space(next_layer, work.name) if len(next_layer) else work.whole_space
+        functionals = null_space(next_layer, work.name) if len(next_layer) else work.full_space_rows
         directions = complement(next_layer, layer, work.name)
         m = len(directions)
-        actions = products(rows, directions, work.constants) @ functionals.T
+        actions = brackets_of_rows(rows, directions, work.constants) @ functionals.T
         images = directions @ functionals.T
-        brackets = products(rows, rows, work.constants)
+        brackets = brackets_of_rows(rows, rows, work.constants)
         defects = (brackets - np.tensordot(levi_constants, rows, axes=(2, 0))) @ functionals.T
         equations, values = [], []
         for i in range(n):

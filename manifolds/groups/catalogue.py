@@ -209,7 +209,7 @@ _MAX_NEWTON_STEPS = 30
 """Largest number of iterations of Newton's method."""
 
 
-def first_factor_coordinates(
+def horizontal_factor_coordinates(
     group: MatrixGroup, horizontal_rows: np.ndarray, stabilizer_rows: np.ndarray, element, max_length: float
 ):
     """Return c, shape (k,), with ``exp(c horizontal_rows) exp(b stabilizer_rows) = element``, by Newton's method.
@@ -217,7 +217,7 @@ def first_factor_coordinates(
     Parameters
     ----------
     horizontal_rows, stabilizer_rows : array, shape (k, dim)
-        Complements of each other in the algebra; h spans a subalgebra.
+        Bases of complementary subspaces of the algebra; the stabilizer is a subalgebra.
     element : array, shape (n, n)
         Element of the group.
     max_length : float
@@ -225,16 +225,19 @@ def first_factor_coordinates(
     """
     d = len(horizontal_rows)
 
-    def factors(z):
-        return [group.exp_map(group.algebra, part) for part in (z[:d] @ horizontal_rows, z[d:] @ stabilizer_rows)]
+    def exponential_factors(z):
+        return [
+            group.exp_map(group.algebra, components)
+            for components in (z[:d] @ horizontal_rows, z[d:] @ stabilizer_rows)
+        ]
 
     def residual(z, element):
-        a, b = factors(z)
+        a, b = exponential_factors(z)
         return a @ b - element
 
     def residual_in_algebra(z, element):
         """Return the residual as a vector of the algebra, which vanishes where the residual does."""
-        a, b = factors(z)
+        a, b = exponential_factors(z)
         return group.algebra.vee(group.inverse_map(a @ b) @ residual(z, element))
 
     def to_real_vector(a):

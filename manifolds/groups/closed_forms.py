@@ -16,7 +16,7 @@ import numpy as np
 from ..algebras.lie_algebra import LieAlgebra
 from ..matrices.exponential import (
     HALF_TURN_MARGIN,
-    _root_or_nan,
+    _sqrt_or_nan,
     _squared_length,
     angle_over_sine,
     leading_sign,
@@ -135,7 +135,7 @@ def adjoint_cayley_gl2(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     half = jnp.trace(X, axis1=-2, axis2=-1)[..., None, None] / 2
     X = X - half * identity
     square = -jnp.trace(X @ X, axis1=-2, axis2=-1).real[..., None, None] / 2
-    return jnp.exp(half) * (identity + X) / _root_or_nan(1.0 + square)
+    return jnp.exp(half) * (identity + X) / _sqrt_or_nan(1.0 + square)
 
 
 def adjoint_cayley_so4(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
@@ -207,7 +207,7 @@ def invertible_defect(g) -> jax.Array:
 
 def heisenberg_defect(g) -> jax.Array:
     """Return the distance from I of the entries outside the first row and the last column."""
-    return max_abs_entry(jnp.where(_coordinate_mask(g), 0.0, g - np.eye(g.shape[-1])))
+    return max_abs_entry(jnp.where(_heisenberg_coordinate_mask(g), 0.0, g - np.eye(g.shape[-1])))
 
 
 # -- equations: they vanish on the group, and products from the right with its elements do not change them ----------
@@ -299,7 +299,7 @@ def restore_symplectic(g) -> jax.Array:
 
 def restore_heisenberg(g) -> jax.Array:
     """Return g with the entries outside the first row and the last column replaced by those of I."""
-    return jnp.where(_coordinate_mask(g), g, np.eye(g.shape[-1]))
+    return jnp.where(_heisenberg_coordinate_mask(g), g, np.eye(g.shape[-1]))
 
 
 def affine_matrix(linear: jax.Array, translation: jax.Array) -> jax.Array:
@@ -312,8 +312,8 @@ def affine_matrix(linear: jax.Array, translation: jax.Array) -> jax.Array:
 # -- helpers ------------------------------------------------------------------------------------------------------
 
 
-def _coordinate_mask(g) -> np.ndarray:
-    """Return a mask of the entries that are coordinates of the Heisenberg group, shape (m, m)."""
+def _heisenberg_coordinate_mask(g) -> np.ndarray:
+    """Return a mask of the matrix entries that are coordinates of the Heisenberg group, shape (m, m)."""
     mask = np.zeros(g.shape[-2:], dtype=bool)
     mask[0, 1:] = mask[:-1, -1] = True
     return mask

@@ -20,7 +20,7 @@ from ..algebras.blocks import direct_sum
 from ..algebras.lie_algebra import LieAlgebra
 from ..errors import ClosureError, ParameterError
 from ..matrices.exponential import CAYLEY_CONDITION_LIMIT, cayley_of, expm
-from ..matrices.linear import _one_norm, _square_root, determinant, max_abs_entry, solve, solve_near_identity
+from ..matrices.linear import _matrix_square_root, _one_norm, determinant, max_abs_entry, solve, solve_near_identity
 
 _NODES = np.polynomial.legendre.leggauss(32)[0][16:]
 """Nodes of Gauss quadrature of even functions on [0, 1]: half of the rule with 32 nodes on [-1, 1]."""
@@ -138,14 +138,14 @@ def log(algebra: LieAlgebra, g) -> jax.Array:
     """
     identity, batch = jnp.eye(g.shape[-1], dtype=g.dtype), g.shape[:-2]
 
-    def is_far(state):
+    def is_far_from_identity(state):
         s, _, is_converged = state
         return is_converged & (_one_norm(s - identity) > 0.25)
 
     def take_square_root(state):
         s, halvings, is_converged = state
-        root, _, success = _square_root(s)
-        needs_root = is_far(state)
+        root, _, success = _matrix_square_root(s)
+        needs_root = is_far_from_identity(state)
         return (
             jnp.where(needs_root[..., None, None], root, s),
             halvings + needs_root,
@@ -154,7 +154,9 @@ def log(algebra: LieAlgebra, g) -> jax.Array:
 
     log_scale = jnp.log(jnp.abs(determinant(g)))[..., None, None] / g.shape[-1]
     start = (g / jnp.exp(log_scale), jnp.zeros(batch), jnp.ones(batch, dtype=bool))
-    s, halvings, is_converged = jax.lax.while_loop(lambda state: is_far(state).any(), take_square_root, start)
+    s, halvings, is_converged = jax.lax.while_loop(
+        lambda state: is_far_from_identity(state).any(), take_square_root, start
+    )
     Z = solve(s + identity, s - identity)
     Z2, series = Z @ Z, jnp.zeros_like(g)
     for k in reversed(range(9)):  # |Z| < 1/7, so the first term left out is below rounding
@@ -187,8 +189,8 @@ class BlockMap:
     gives_components: bool = False
 
     def __call__(self, algebra: LieAlgebra, argument) -> jax.Array:
-        parts = (_split_components if self.takes_components else split_blocks)(self.algebras, argument)
-        images = [f(g, part) for f, g, part in zip(self.maps, self.algebras, parts, strict=True)]
+        blocks = (_split_components if self.takes_components else split_blocks)(self.algebras, argument)
+        images = [f(g, block) for f, g, block in zip(self.maps, self.algebras, blocks, strict=True)]
         return jnp.concatenate(images, axis=-1) if self.gives_components else join_blocks(images)
 
 
@@ -213,10 +215,10 @@ class BlockDefect:
 
     def __call__(self, g) -> jax.Array:
         blocks = split_blocks(self.algebras, g)
-        largest = jnp.abs(g - join_blocks(blocks)).max(axis=(-2, -1))
+        max_distance = jnp.abs(g - join_blocks(blocks)).max(axis=(-2, -1))
         for defect, block in zip(self.defects, blocks, strict=True):
-            largest = jnp.maximum(largest, defect(block))
-        return largest
+            max_distance = jnp.maximum(max_distance, defect(block))
+        return max_distance
 
 
 @dataclass(frozen=True)
@@ -231,28 +233,28 @@ class BlockEquations:
         return jnp.concatenate([f(block) for f, block in zip(self.equations, blocks, strict=True)], axis=-1)
 
 
-def product_fields(first: Any, second: Any) -> dict[str, Any]:
-    """Return the fields of the product of two matrix groups, by name."""
-    groups = (first, second)
+def product_group_fields(group_1: Any, group_2: Any) -> dict[str, Any]:
+    """Return the fields of the :class:`.MatrixGroup` that is the product of two groups, by name."""
+    groups = (group_1, group_2)
     algebras = tuple(group.algebra for group in groups)
 
-    def maps_of_components(kind: str) -> BlockMap | None:
+    def block_map_of_components(kind: str) -> BlockMap | None:
         maps = tuple({"cayley": g.cayley_map, "adjoint_cayley": g.adjoint_cayley_map}[kind] for g in groups)
         return None if None in maps else BlockMap(maps, algebras, takes_components=True)
 
     equations = tuple(group.equations for group in groups)
     return {
-        "name": f"{first.name} x {second.name}",
+        "name": f"{group_1.name} x {group_2.name}",
         "algebra": direct_sum(*algebras),
         "defect": BlockDefect(tuple(group.defect for group in groups), algebras),
         "inverse_map": MatrixBlockMap(tuple(group.inverse_map for group in groups), algebras),
         "exp_map": BlockMap(tuple(group.exp_map for group in groups), algebras, takes_components=True),
         "log_map": BlockMap(tuple(group.log_map for group in groups), algebras, gives_components=True),
-        "cayley_map": maps_of_components("cayley"),
+        "cayley_map": block_map_of_components("cayley"),
         "inverse_cayley_map": BlockMap(
             tuple(group.inverse_cayley_map for group in groups), algebras, gives_components=True
         ),
-        "adjoint_cayley_map": maps_of_components("adjoint_cayley"),
+        "adjoint_cayley_map": block_map_of_components("adjoint_cayley"),
         "restore_map": MatrixBlockMap(tuple(group.restore_map for group in groups), algebras),
         "equations": None if None in equations else BlockEquations(equations, algebras),
     }
@@ -270,7 +272,7 @@ def split_blocks(algebras: tuple[LieAlgebra, ...], g) -> list[jax.Array]:
 
 
 def join_blocks(blocks: list[jax.Array]) -> jax.Array:
-    """Return block diagonal matrices, shape (..., m, m)."""
+    """Return block diagonal matrices, shape (..., m, m), from their blocks."""
     size, start, rows = sum(block.shape[-1] for block in blocks), 0, []
     for block in blocks:
         n = block.shape[-1]
@@ -281,11 +283,12 @@ def join_blocks(blocks: list[jax.Array]) -> jax.Array:
 
 
 def _split_components(algebras: tuple[LieAlgebra, ...], x) -> list[jax.Array]:
-    parts, start = [], 0
+    """Return the components of an element of a direct sum in each summand, shapes (..., dim of the summand)."""
+    components, start = [], 0
     for algebra in algebras:
-        parts.append(x[..., start : start + algebra.dim])
+        components.append(x[..., start : start + algebra.dim])
         start += algebra.dim
-    return parts
+    return components
 
 
 IDENTITY_TOLERANCE = 1e-12
@@ -341,7 +344,7 @@ class EquationRestore:
 
 
 def fields_from_equations(function: Callable, n: int, name: str) -> dict[str, Any]:
-    """Return the fields of a matrix group of the solutions of equations near the identity.
+    """Return the fields, by name, of the matrix group of the solutions of equations near the identity.
 
     The parameters and errors are those of :meth:`manifolds.MatrixGroup.from_equations`.
     """

@@ -27,7 +27,7 @@ from ..matrices.exponential import CAYLEY_CONDITION_LIMIT, HALF_TURN_MARGIN, cay
 from ..matrices.linear import inverse, max_abs_entry, solve
 from . import closed_forms as closed
 from . import maps
-from .maps import fields_from_equations, product_fields
+from .maps import fields_from_equations, product_group_fields
 
 MEMBERSHIP_TOLERANCE = 1e-8
 """Largest distance of a matrix from the group, relative to its size, at which its logarithm is taken."""
@@ -147,7 +147,7 @@ class MatrixGroup(metaclass=ListedType):
 
     def __mul__(self, other: MatrixGroup) -> MatrixGroup:
         """Return the product of two groups, whose matrices are block diagonal; its algebra is the direct sum."""
-        return MatrixGroup(**product_fields(self, other)) if isinstance(other, MatrixGroup) else NotImplemented
+        return MatrixGroup(**product_group_fields(self, other)) if isinstance(other, MatrixGroup) else NotImplemented
 
     @property
     def dim(self) -> int:
@@ -468,18 +468,18 @@ class _BatchedFunction:
 def _batched_defect(defect: Callable, name: str, basis: np.ndarray) -> Callable:
     """Return the defect of a group as a function of batches; LieAlgebraError if it maps no matrix to a number."""
 
-    def shape(batch: tuple[int, ...]) -> tuple[int, ...] | None:
+    def output_shape(batch: tuple[int, ...]) -> tuple[int, ...] | None:
         try:
             return np.shape(jax.eval_shape(defect, jax.ShapeDtypeStruct((*batch, *basis.shape[1:]), basis.dtype)))
         except (TypeError, ValueError, IndexError):
             return None
 
-    if shape((2, 3)) == (2, 3):
+    if output_shape((2, 3)) == (2, 3):
         return defect
-    if shape(()) != ():
+    if output_shape(()) != ():
         raise LieAlgebraError(
             f"the defect of {name} must be a number for a matrix, a JAX array of shape {basis.shape[1:]}: it gives "
-            f"{'an error' if shape(()) is None else f'an array of shape {shape(())}'}"
+            f"{'an error' if output_shape(()) is None else f'an array of shape {output_shape(())}'}"
         )
     return _BatchedFunction(defect)
 

@@ -31,11 +31,11 @@ class MatrixFunction(Protocol):
     """
 
     def decompose(self, a, unrolled: bool) -> tuple[jax.Array, ...]:
-        """Return what all chains of one matrix share, such as its eigenvalues and eigenvectors."""
+        """Return the arrays that all chains of one matrix share, such as its eigenvalues and eigenvectors."""
         ...
 
     def chain(self, decompositions, slots: tuple[int, ...], shifts, directions, unrolled: bool) -> jax.Array:
-        """Return the chain of the directions, from the decompositions of the matrices."""
+        """Return the chain of the directions, a term of a derivative of f, from the decompositions of the matrices."""
         ...
 
 
@@ -48,8 +48,11 @@ All arguments have equally many leading axes, and broadcast along axes of length
 """
 
 
-def chain(function: MatrixFunction, matrices, slots, shifts, directions=()) -> jax.Array:
-    """Return the chain after converting the arrays to one type and number of leading axes."""
+def matrix_function_chain(function: MatrixFunction, matrices, slots, shifts, directions=()) -> jax.Array:
+    """Return the chain of a matrix function in the directions: a term of its derivative, or its value without any.
+
+    The arrays are converted to one type and one number of leading axes for the primitive :data:`chain_p`.
+    """
     arrays = [*matrices, *directions]
     dtype = jnp.result_type(*arrays)
     rank = max(*(np.ndim(a) - 2 for a in arrays), np.ndim(shifts) - 1)
@@ -60,17 +63,19 @@ def chain(function: MatrixFunction, matrices, slots, shifts, directions=()) -> j
 
 
 def _with_rank(a, rank: int):
+    """Return an array with leading axes of length 1, so that it has ``rank`` axes."""
     return a if a.ndim == rank else a.reshape((1,) * (rank - a.ndim) + a.shape)
 
 
 def evaluate_chain(*arrays, function: MatrixFunction, slots: tuple[int, ...]) -> jax.Array:
-    """Evaluate the primitive by other JAX operations."""
+    """Evaluate the chain of a matrix function from the arguments of its primitive, by other JAX operations."""
     matrices, shifts, directions = _split_arguments(arrays, slots)
     decompositions = [function.decompose(a, unrolled=False) for a in matrices]
     return function.chain(decompositions, slots, shifts, directions, unrolled=False)
 
 
 def _split_arguments(arrays, slots) -> tuple[list, Any, list]:
+    """Return the matrices, the shifts and the directions among the arguments of the primitive."""
     m = len(arrays) - len(slots)
     return list(arrays[:m]), arrays[m], list(arrays[m + 1 :])
 

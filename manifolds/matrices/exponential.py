@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .chains import chain
+from .chains import matrix_function_chain
 from .linear import _one_norm, max_abs_entry, solve
 
 HALF_TURN_MARGIN = 1e-8
@@ -26,7 +26,7 @@ def stumpff(order: int, z) -> jax.Array:
     With ``z = t**2``: cos t, sin t / t, (1 - cos t) / t**2, (t - sin t) / t**3.
     """
     closed_form = (jnp.cos, _sinc, lambda t: 0.5 * _sinc(t / 2) ** 2, lambda t: (t - jnp.sin(t)) / t**3)[order]
-    return _piecewise(_stumpff_series(order, -1.0), closed_form, z, 1.0)
+    return _series_or_closed_form(_stumpff_series(order, -1.0), closed_form, z, 1.0)
 
 
 def hyperbolic_stumpff(order: int, z) -> jax.Array:
@@ -35,7 +35,7 @@ def hyperbolic_stumpff(order: int, z) -> jax.Array:
     With ``z = t**2``: cosh t, sinh t / t, (cosh t - 1) / t**2.
     """
     closed_form = (jnp.cosh, _sinhc, lambda t: 0.5 * _sinhc(t / 2) ** 2)[order]
-    return _piecewise(_stumpff_series(order, 1.0), closed_form, z, 1.0)
+    return _series_or_closed_form(_stumpff_series(order, 1.0), closed_form, z, 1.0)
 
 
 def angle_over_sine(z, cosine) -> jax.Array:
@@ -53,7 +53,7 @@ def angle_over_sine(z, cosine) -> jax.Array:
 def arcsinh_over_sinh(z) -> jax.Array:
     """Return ``arcsinh(s) / s`` with ``z = s**2``, smooth at 0."""
     terms = [(-0.25) ** k * math.comb(2 * k, k) / (2 * k + 1) for k in range(9)]
-    return _piecewise(terms, lambda s: jnp.arcsinh(s) / s, z, 0.01)
+    return _series_or_closed_form(terms, lambda s: jnp.arcsinh(s) / s, z, 0.01)
 
 
 def leading_sign(x) -> jax.Array:
@@ -70,7 +70,7 @@ def leading_sign(x) -> jax.Array:
     return sign
 
 
-def _root_or_nan(z):
+def _sqrt_or_nan(z):
     """Return ``sqrt(z)``, NaN where z <= 0."""
     return jnp.sqrt(jnp.where(z > 0.0, z, jnp.nan))
 
@@ -96,7 +96,7 @@ def _stumpff_series(order: int, sign: float) -> list[float]:
     return [sign**k / math.factorial(2 * k + order) for k in range(10)]
 
 
-def _piecewise(coefficients: list[float], closed_form: Callable, z, radius: float) -> jax.Array:
+def _series_or_closed_form(coefficients: list[float], closed_form: Callable, z, radius: float) -> jax.Array:
     """Evaluate a power series in z for z < radius, and ``closed_form(sqrt z)`` beyond.
 
     Each branch receives arguments at which it is smooth, so that no gradient is NaN.
@@ -122,7 +122,7 @@ def expm(X) -> jax.Array:
     ``jax.scipy.linalg.expm`` (0.10) rounds the number of squarings down, not up, and so loses up to eight digits at
     norms above 5.4. This function takes norms up to 3e5; larger ones give NaN.
     """
-    return chain(Exponential(), [jnp.asarray(X)], (0,), np.zeros(1))
+    return matrix_function_chain(Exponential(), [jnp.asarray(X)], (0,), np.zeros(1))
 
 
 @dataclass(frozen=True)
@@ -166,6 +166,7 @@ class Exponential:
 
 
 def _pade_exponential(X, is_unrolled: bool) -> jax.Array:
+    """Return the matrix exponential by the [13/13] Padé approximant with scaling and squaring, shape (..., n, n)."""
     identity = np.eye(X.shape[-1])
     squarings = jnp.ceil(jnp.log2(jnp.maximum(_one_norm(X) / _PADE_RADIUS, 1.0)))[..., None, None]
     Y, b = X / 2.0**squarings, _PADE_COEFFICIENTS
@@ -177,12 +178,12 @@ def _pade_exponential(X, is_unrolled: bool) -> jax.Array:
     quotient = jnp.linalg.solve if is_unrolled else solve
     g = identity + 2 * quotient(even_terms - odd_terms, odd_terms)  # not (even + odd): keeps the digits of a small X
 
-    def square(state):
+    def square_if_needed(state):
         k, g = state
         return k + 1.0, jnp.where(k < squarings, g @ g, g)
 
     n_squarings = jnp.minimum(jnp.max(squarings), _MAX_SQUARINGS)
-    g = jax.lax.while_loop(lambda state: state[0] < n_squarings, square, (jnp.zeros(()), g))[1]
+    g = jax.lax.while_loop(lambda state: state[0] < n_squarings, square_if_needed, (jnp.zeros(()), g))[1]
     return jnp.where(squarings <= _MAX_SQUARINGS, g, jnp.nan)
 
 

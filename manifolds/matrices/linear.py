@@ -50,7 +50,7 @@ def orthonormal_complement(u) -> jax.Array:
     return complement
 
 
-def _square_root(a):
+def _matrix_square_root(a):
     """Return the principal square root, its inverse, and a flag of convergence, by Denman and Beavers' iteration.
 
     The iterates (y, z) tend to (a^1/2, a^-1/2) [Higham 2008, eq. 6.15]. An eigenvalue at the angle pi - d costs
@@ -61,13 +61,15 @@ def _square_root(a):
         _, change, steps = state
         return ((change > 1e-8) & (steps < _MAX_ROOT_STEPS)).any()
 
-    def newton(state):
+    def denman_beavers_step(state):
         roots, _, steps = state
         new = (roots + inverse(roots[::-1])) / 2
         return new, max_abs_entry(new[0] - roots[0]) / max_abs_entry(new[0]), steps + 1
 
     roots = jnp.stack([a, jnp.broadcast_to(np.eye(a.shape[-1], dtype=a.dtype), a.shape)])
-    roots, change, _ = jax.lax.while_loop(is_unfinished, newton, (roots, jnp.full(a.shape[:-2], jnp.inf), 0))
+    roots, change, _ = jax.lax.while_loop(
+        is_unfinished, denman_beavers_step, (roots, jnp.full(a.shape[:-2], jnp.inf), 0)
+    )
     return *roots, change <= 1e-8  # quadratic convergence: a step of 1e-8 ends at rounding
 
 
@@ -99,13 +101,13 @@ def solve_near_identity(a, b) -> jax.Array:
     batch = jnp.broadcast_shapes(a.shape[:-2], b.shape[:-2])
     a, b = (jnp.broadcast_to(m, (*batch, *m.shape[-2:])) for m in (a, b))
 
-    def step(_, table):
+    def eliminate_column(_, table):
         pivot_row = table[..., :1, :] / table[..., :1, :1]
         lower_rows = table[..., 1:, :] - table[..., 1:, :1] * pivot_row
         table = jnp.concatenate([lower_rows, pivot_row], axis=-2)[..., 1:]
         return jnp.concatenate([table, jnp.zeros_like(table[..., :1])], axis=-1)
 
-    return jax.lax.fori_loop(0, a.shape[-1], step, jnp.concatenate([a, b], axis=-1))[..., : b.shape[-1]]
+    return jax.lax.fori_loop(0, a.shape[-1], eliminate_column, jnp.concatenate([a, b], axis=-1))[..., : b.shape[-1]]
 
 
 def solve_lyapunov(g, c) -> jax.Array:
@@ -123,8 +125,8 @@ def inverse(a) -> jax.Array:
     return solve(a, jnp.broadcast_to(np.eye(a.shape[-1], dtype=a.dtype), a.shape))
 
 
-def conjugate_by_stages(B, w, A) -> jax.Array:
-    """Return ``U_i w U_i^H``, shape (s, n, n), where the U_i are the stages of ``U' = B U`` from the identity.
+def conjugate_by_collocation_stages(B, w, A) -> jax.Array:
+    """Return ``U_i w U_i^H``, shape (s, n, n), where the U_i are the collocation stages of ``U' = B U`` from U = 1.
 
     Multiples of the identity are removed from B: they change only the phase of U, and may be large.
 
@@ -149,7 +151,7 @@ def _remove_trace(a):
     return a - (jnp.trace(a, axis1=-2, axis2=-1) / n)[..., None, None] * np.eye(n)
 
 
-def cayley_rate(k, b) -> jax.Array:
+def inverse_dcayley(k, b) -> jax.Array:
     """Return ``k'`` for which ``U = (1 - k/2)^-1 (1 + k/2)`` moves by ``U' = B U``, for skew-Hermitian k and B, shape
     (n, n).
 
@@ -211,6 +213,7 @@ def max_abs_entry(matrix) -> jax.Array:
 
 
 def _one_norm(matrix) -> jax.Array:
+    """Return the 1-norm, the largest sum of the absolute values in a column, shape (...)."""
     return jnp.abs(matrix).sum(axis=-2).max(axis=-1)
 
 
@@ -223,7 +226,7 @@ def _eliminate(a, b):
     m = a.shape[-1]
     row = np.arange(m)
 
-    def step(k, state):
+    def eliminate_column(k, state):
         table, det = state
         column = table[..., 0]
         pivot_index = jnp.argmax(jnp.where(row < m - k, jnp.abs(column), -1.0), axis=-1)[..., None]
@@ -237,7 +240,7 @@ def _eliminate(a, b):
         return table, det * jnp.where(pivot_index == 0, pivot[..., 0], -pivot[..., 0])[..., 0]
 
     start = (jnp.concatenate([a, b], axis=-1), jnp.ones(a.shape[:-2], dtype=a.dtype))
-    table, det = jax.lax.fori_loop(0, m, step, start)
+    table, det = jax.lax.fori_loop(0, m, eliminate_column, start)
     return table[..., : b.shape[-1]], det
 
 

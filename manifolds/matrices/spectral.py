@@ -17,7 +17,7 @@ import numpy as np
 import scipy.special
 
 from .._pytree_module import forward_to
-from .chains import chain
+from .chains import matrix_function_chain
 from .linear import adjoint
 from .symmetric import eigh
 
@@ -61,6 +61,7 @@ class ScalarFunction:
         )
 
     def _mean_or_quotient(self, *points) -> jax.Array:
+        """Return a divided difference: by a mean of derivatives if the points are close, else by differences."""
         sorted_points = _sort_entrywise(points)
         width = jnp.stack([self.width(x) for x in sorted_points]).min(axis=0)
         gap = sorted_points[-1] - sorted_points[0]
@@ -73,8 +74,8 @@ class ScalarFunction:
         quadrature."""
         k = len(points) - 1
         barycentric, weights = _simplex_quadrature(k, n_nodes)
-        nodes_at = jnp.tensordot(barycentric, jnp.stack(points), 1)
-        return jnp.tensordot(weights, self.derivative(nodes_at, k), 1)
+        nodes = jnp.tensordot(barycentric, jnp.stack(points), 1)
+        return jnp.tensordot(weights, self.derivative(nodes, k), 1)
 
 
 def _sort_entrywise(points) -> list[jax.Array]:
@@ -271,7 +272,7 @@ def spectral(f: Callable | ScalarFunction, a) -> jax.Array:
     array, shape (..., n, n)
         NaN where f is not defined at an eigenvalue.
     """
-    return chain(SpectralFunction(scalar_function(f)), [jnp.asarray(a)], (0,), np.zeros(1))
+    return matrix_function_chain(SpectralFunction(scalar_function(f)), [jnp.asarray(a)], (0,), np.zeros(1))
 
 
 def spectral_trace(f: Callable | ScalarFunction, a) -> jax.Array:
@@ -313,7 +314,7 @@ def spectral_difference(f: Callable | ScalarFunction, a, b) -> jax.Array:
         Hermitian.
     """
     a, b = jnp.asarray(a), jnp.asarray(b)
-    gradient = chain(
+    gradient = matrix_function_chain(
         SpectralFunction(scalar_function(f)), [a, b], (0, 1), np.zeros(2), [np.eye(a.shape[-1], dtype=a.dtype)]
     )
     return (gradient + adjoint(gradient)) / 2
@@ -335,7 +336,9 @@ def log_mean(logs, shift, x) -> jax.Array:
     x : array, shape (..., n, n)
     """
     shift = jnp.asarray(shift)
-    return chain(SpectralFunction(scalar_function(jnp.exp)), [logs], (0, 0), jnp.stack([-shift, shift], axis=-1), [x])
+    return matrix_function_chain(
+        SpectralFunction(scalar_function(jnp.exp)), [logs], (0, 0), jnp.stack([-shift, shift], axis=-1), [x]
+    )
 
 
 @dataclass(frozen=True)
@@ -370,6 +373,7 @@ class SpectralFunction:
 
 
 def _eigenvectors(a) -> tuple[jax.Array, jax.Array]:
+    """Return the eigenvalues of the Hermitian part of a, in no order, and orthonormal eigenvectors as columns."""
     a = (a + adjoint(a)) / 2
     if a.shape[-1] > MAX_JACOBI_ROWS:
         vectors, values = jax.lax.linalg.eigh(a, symmetrize_input=False, sort_eigenvalues=False)

@@ -66,14 +66,14 @@ def eigh(a) -> tuple[jax.Array, jax.Array]:
     # one or two sweeps more than random matrices of size 3, 10, 30, 50 need: 4, 7, 8, 9
     axes = _sweep_plane_axes(n, 1 if n == 2 else 4 + n.bit_length())
 
-    def rotate(state, axes):
+    def apply_rotation(state, axes):
         a, vectors = state
         e, f = axes
         J = _jacobi_rotation(axes, *(u @ a @ v for u, v in ((e, e), (f, f), (e, f))))
         return (adjoint(J) @ a @ J, vectors @ J), None
 
     start = (a + adjoint(a)) / 2, jnp.broadcast_to(np.eye(n, dtype=a.dtype), a.shape)
-    (d, vectors), _ = jax.lax.scan(rotate, start, axes)
+    (d, vectors), _ = jax.lax.scan(apply_rotation, start, axes)
     values = jnp.diagonal(d, axis1=-2, axis2=-1).real
     is_converged = max_abs_entry(d * (1.0 - np.eye(n))) <= 1e-14 * max_abs_entry(a)
     return jnp.where(is_converged[..., None], values, jnp.nan), vectors
@@ -108,7 +108,7 @@ def _jacobi_rotation(axes, alpha, beta, entry):
 
 
 def orthogonal_images(a) -> tuple[jax.Array, jax.Array]:
-    """Return ``a V``, shape (..., m, n), with orthogonal columns, and the unitary V, shape (..., n, n).
+    """Return ``a V``, shape (..., m, n), with orthogonal columns, and the unitary V, shape (..., n, n): a Jacobi SVD.
 
     The norms of the columns are the singular values of a, in no order, each accurate to a rounding of the largest:
     no product of a with itself is formed. The columns are rotated by Jacobi's method [Hestenes 1958].
@@ -116,14 +116,14 @@ def orthogonal_images(a) -> tuple[jax.Array, jax.Array]:
     n = a.shape[-1]
     axes = _sweep_plane_axes(n, 5 + n.bit_length())
 
-    def rotate(state, axes):
+    def apply_rotation(state, axes):
         images, vectors = state
         u, v = images @ axes[0], images @ axes[1]
         J = _jacobi_rotation(axes, *((p.conj() * q).sum(axis=-1) for p, q in ((u, u), (v, v), (u, v))))
         return (images @ J, vectors @ J), None
 
     start = a, jnp.broadcast_to(np.eye(n, dtype=a.dtype), (*a.shape[:-2], n, n))
-    return jax.lax.scan(rotate, start, axes)[0]
+    return jax.lax.scan(apply_rotation, start, axes)[0]
 
 
 @jax.custom_jvp

@@ -194,13 +194,15 @@ class ProjectionRetraction(Chart):
         def residual(c):
             return self._point(z, space._from_coordinates(z, c)) - x
 
-        def newton(_, c):
+        def newton_step(_, c):
             residual_value, push_forward = jax.linearize(residual, c)
             axes = jnp.broadcast_to(jnp.eye(space.dim), (*c.shape, space.dim))
             columns = jax.vmap(lambda axis: space._coordinates(z, push_forward(axis)), in_axes=-1, out_axes=-1)(axes)
             return c - solve(columns, space._coordinates(z, residual_value)[..., None])[..., 0]
 
-        c = jax.lax.fori_loop(0, _MAX_NEWTON_STEPS, newton, space._coordinates(z, space._project_tangent(z, x - z)))
+        c = jax.lax.fori_loop(
+            0, _MAX_NEWTON_STEPS, newton_step, space._coordinates(z, space._project_tangent(z, x - z))
+        )
         defect = jnp.abs(residual(c)).max(axis=space._axes, keepdims=True)
         scale = jnp.maximum(jnp.abs(x).max(axis=space._axes, keepdims=True), 1.0)
         return jnp.where(defect <= MEMBERSHIP_TOLERANCE * scale, space._from_coordinates(z, c), jnp.nan)

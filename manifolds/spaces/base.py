@@ -20,6 +20,13 @@ CUT_MARGIN = 1e-8
 """Smallest relative distance from the cut locus at which a logarithm is taken; below, rounding decides its
 direction."""
 
+MIN_CUT_ANGLE = 2e-14
+"""Smallest angle from the cut locus at which a closed form returns a logarithm.
+
+At an angle a its direction is known to about 1e-16 / a, and the point to which it leads, to rounding. At smaller angles
+nothing is known of the direction.
+"""
+
 _registry: list[tuple[Callable[..., Space], tuple]] = []
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from .._arguments import checked_size
 from ..matrices.exponential import angle_over_sine, arcsinh_over_sinh, hyperbolic_stumpff, stumpff
 from ..matrices.linear import orthonormal_complement, skew_matrix
-from .base import CUT_MARGIN, Space, register
+from .base import MIN_CUT_ANGLE, Space, register
 from .maps import inner_by_coordinates, safe_sqrt, tangential_part_by_projection
 
 
@@ -212,7 +212,7 @@ class Sphere(Space):
         w = step - _dot(x, step) * x  # of length sin(angle); free of cancellation for neighbours
         w = w - _dot(x, w) * x  # near the antipode the first pass leaves rounding that is not tangent
         z, cosine = _dot(w, w), _dot(x, y)
-        is_defined = (cosine > 0) | (z > (math.pi * CUT_MARGIN) ** 2)
+        is_defined = (cosine > 0) | (z > MIN_CUT_ANGLE**2)
         return jnp.where(is_defined, angle_over_sine(z, cosine) * w, jnp.nan)
 
     def _squared_distance(self, x, y):
@@ -220,9 +220,11 @@ class Sphere(Space):
         return 4.0 * chord * angle_over_sine(chord, safe_sqrt(cochord)) ** 2
 
     def _midpoint(self, x, y):
-        chord_sum = x + y
-        z = _dot(chord_sum, chord_sum)
-        return jnp.where(z > (math.pi * CUT_MARGIN) ** 2, chord_sum / jnp.sqrt(z), jnp.nan)
+        chord, chord_sum = y - x, x + y
+        z, w = _dot(chord_sum, chord_sum), _dot(chord, chord)
+        # near the antipode the sum is all rounding along the chord, which would bring the midpoint nearer to one end
+        direction = chord_sum - _dot(chord_sum, chord) / jnp.where(w > 1.0, w, 1.0) * chord
+        return jnp.where(z > MIN_CUT_ANGLE**2, direction / jnp.sqrt(_dot(direction, direction)), jnp.nan)
 
     def _transport(self, x, v, u):
         z = _dot(v, v)
@@ -231,7 +233,7 @@ class Sphere(Space):
     def _explain_missing_log(self, x, y):
         gap = float(jnp.sqrt(((x + y) ** 2).sum()))
         return (
-            f"y is within {gap:.2g} of the antipode of x (margin {math.pi * CUT_MARGIN:.1e}), to which every direction "
+            f"y is within {gap:.2g} of the antipode of x (margin {MIN_CUT_ANGLE:.1e}), to which every direction "
             "leads; go by a point between them"
         )
 
@@ -247,9 +249,9 @@ class Hyperbolic(Space):
     """Points with ``-x_0^2 + x_1^2 + … + x_n^2 = -1``, ``x_0 > 0``, shape (n + 1,), and the metric of curvature -1.
 
     All maps have closed forms. A point at distance r from the apex (1, 0, ..., 0) has coordinates of the size e^r, so
-    its
-    position, and with it a distance, is known to about 1e-16 e^r. Vectors at it, and geodesics with given velocities,
-    are
+    its position, and with it a distance, is known to about 1e-16 e^r. From r = 35 on, this is more than the unit of
+    length: directions from the apex that agree to rounding are taken as equal there, so that points on one ray have the
+    difference of their radii as distance, up to r = 350. Vectors at a point, and geodesics with given velocities, are
     known to about 1e-16 e^(2r): keep the states of interest near the apex.
     """
 
@@ -338,6 +340,8 @@ class Hyperbolic(Space):
 
         Far from the apex it is the sum ``4 sinh((r - s)/2)^2 + 4 sinh(r) sinh(s) sin(a/2)^2``, with the radii r and s
         and the angle a between them. Nearer it is the difference as it stands for neighbours, else ``-2 - 2 <x, y>``.
+        Where rounding of the coordinates alone makes more than 1 of the second term, directions equal to rounding are
+        equal.
         """
         x0, y0, p, q = x[..., :1], y[..., :1], x[..., 1:], y[..., 1:]
         step = y - x
@@ -355,9 +359,10 @@ class Hyperbolic(Space):
         )
         direction_difference = (q - p) - inner_point * (difference / (min_sinh * (a + b)))  # exact for neighbours
         direction_difference = jnp.where(max_sinh < 2.0 * min_sinh, direction_difference / max_sinh, q / b - p / a)
-        far_value = 2.0 * radial**2 / (1.0 + jnp.sqrt(1.0 + radial**2)) + a * b * _dot(
-            direction_difference, direction_difference
-        )
+        square = _dot(direction_difference, direction_difference)
+        is_same_direction = (square < _DIRECTION_ROUNDING**2) & (a * b * _DIRECTION_ROUNDING**2 > 1.0)
+        square = jnp.where(is_same_direction, 0.0, square)
+        far_value = 2.0 * radial**2 / (1.0 + jnp.sqrt(1.0 + radial**2)) + a * b * square
         return jnp.where(is_far, far_value, jnp.where(separate_value > 1.0, separate_value, near_value))
 
     def _midpoint(self, x, y):
@@ -370,6 +375,9 @@ class Hyperbolic(Space):
 
 _MIN_FAR_COSH = 2.0
 """Smallest cosh of the radius of points whose directions from the apex are computed."""
+
+_DIRECTION_ROUNDING = 8 * np.finfo(float).eps
+"""Largest difference of two computed directions from the apex that may come from rounding alone."""
 
 
 def _minkowski_product(u, v):

@@ -177,10 +177,10 @@ class GroupSpace(Space):
         return jnp.where((self.group.defect(x) <= MEMBERSHIP_TOLERANCE)[..., None, None], x, jnp.nan)
 
     @property
-    def _n_normal_numbers(self):
+    def _n_gaussian_samples(self):
         return self.dim
 
-    def _point_from_normal_numbers(self, w):
+    def _point_from_gaussian_samples(self, w):
         return self.group.exp_map(self.group.algebra, 0.5 * w)
 
     def _project_tangent(self, x, w):
@@ -341,10 +341,10 @@ class SpecialOrthogonal(BiInvariantSpace):
         return super()._squared_distance(x, y)
 
     @property
-    def _n_normal_numbers(self):
+    def _n_gaussian_samples(self):
         return self.size
 
-    def _point_from_normal_numbers(self, w):
+    def _point_from_gaussian_samples(self, w):
         return _random_rotation(self.from_vector(w))
 
     def _correction(self, x, constraint_change):
@@ -385,10 +385,10 @@ class SpecialUnitary(BiInvariantSpace):
         return x * jnp.exp(-1j * jnp.angle(determinant(x)) / self.n)[..., None, None]
 
     @property
-    def _n_normal_numbers(self):
+    def _n_gaussian_samples(self):
         return self.size
 
-    def _point_from_normal_numbers(self, w):
+    def _point_from_gaussian_samples(self, w):
         return self._scale_to_unit_determinant(orthonormal_columns(self.from_vector(w)))
 
     def _correction(self, x, constraint_change):
@@ -447,10 +447,10 @@ class SpecialEuclidean(GroupSpace):
         return affine_matrix(_nearest_rotation(x[..., :-1, :-1]), x[..., :-1, -1:])
 
     @property
-    def _n_normal_numbers(self):
+    def _n_gaussian_samples(self):
         return self.n * (self.n + 1)
 
-    def _point_from_normal_numbers(self, w):
+    def _point_from_gaussian_samples(self, w):
         rotation_normals, translation_normals = jnp.split(w, [self.n**2], axis=-1)
         rotation = _random_rotation(rotation_normals.reshape(*w.shape[:-1], self.n, self.n))
         return affine_matrix(rotation, self.length * translation_normals[..., None])
@@ -523,7 +523,7 @@ def _nearest_rotation(x):
 
 
 def _random_rotation(w):
-    """Return the rotation made of normal numbers w; its distribution is Haar's, since that of w is rotation
+    """Return the rotation made of Gaussian samples w; its distribution is Haar's, since that of w is rotation
     invariant."""
     x = orthonormal_columns(w)
     return x * jnp.where(np.arange(w.shape[-1]) == 0, determinant(x)[..., None, None], 1.0)

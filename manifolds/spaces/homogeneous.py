@@ -13,7 +13,7 @@ import numpy as np
 from .._arguments import checked_size
 from .._pytree_module import forward_to
 from ..errors import ParameterError, SpaceError
-from ..groups.catalogue import first_factor_coordinates, subalgebra_basis
+from ..groups.catalogue import horizontal_factor_coordinates, subalgebra_basis
 from ..groups.matrix_group import MatrixGroup
 from ..matrices.exponential import expm
 from .base import CUT_MARGIN, Space, register
@@ -110,8 +110,8 @@ class Homogeneous(Space):
     _tangential_part = forward_to("group_space")
     _constraint_rounding_scales = forward_to("group_space")
     _inside = forward_to("group_space")
-    _n_normal_numbers = forward_to("group_space")
-    _point_from_normal_numbers = forward_to("group_space")
+    _n_gaussian_samples = forward_to("group_space")
+    _point_from_gaussian_samples = forward_to("group_space")
 
     # -- horizontal vectors -------------------------------------------------------------------------------------------
 
@@ -152,7 +152,7 @@ class Homogeneous(Space):
     def _single_log_coordinates(self, x, y):
         """Return the horizontal c with ``exp(c) exp(b) = x^-1 y`` for some b in the algebra of H."""
         reach = self.injectivity_radius() * (1.0 - CUT_MARGIN)
-        return first_factor_coordinates(
+        return horizontal_factor_coordinates(
             self.group_space.group,
             self._horizontal_rows,
             self._stabilizer_rows,
@@ -162,6 +162,7 @@ class Homogeneous(Space):
 
 
 def _group_space_of(group) -> BiInvariantSpace:
+    """Return SO(n) or SU(n) as a space, from the space or the matrix group; raise SpaceError for other groups."""
     if isinstance(group, BiInvariantSpace):
         return group
     if isinstance(group, MatrixGroup):

@@ -215,27 +215,28 @@ class LevelSet(Space):
         return self.form is None
 
     def _min_gradient_singular_value(self, x):
+        """Return the least singular value of the gradients of the constraints, made unit vectors, shape (...)."""
         rows = self._constraint_jacobian(x)
         rows = rows / jnp.linalg.norm(rows, axis=-1, keepdims=True)
         return jnp.sqrt(jnp.linalg.eigvalsh(rows @ rows.swapaxes(-1, -2))[..., 0])
 
     def _geodesic(self, x, v, steps):
-        def rate(state):
+        def hamiltonian_rate(state):
             x, p = state
             velocity = self._sharp(x, p)
             return velocity, -0.5 * jax.grad(lambda y: self._pair(p, self._sharp(y, p)))(x)
 
-        def step(_, state):
+        def runge_kutta_step(_, state):
             advance = lambda share, k: jax.tree_util.tree_map(lambda a, b: a + share / steps * b, state, k)  # noqa: E731
-            a = rate(state)
-            b = rate(advance(0.5, a))
-            c = rate(advance(0.5, b))
-            d = rate(advance(1.0, c))
+            a = hamiltonian_rate(state)
+            b = hamiltonian_rate(advance(0.5, a))
+            c = hamiltonian_rate(advance(0.5, b))
+            d = hamiltonian_rate(advance(1.0, c))
             return jax.tree_util.tree_map(
                 lambda y, a, b, c, d: y + (a + 2.0 * b + 2.0 * c + d) / (6.0 * steps), state, a, b, c, d
             )
 
-        return self._project(jax.lax.fori_loop(0, steps, step, (x, self._metric_covector(x, v)))[0])
+        return self._project(jax.lax.fori_loop(0, steps, runge_kutta_step, (x, self._metric_covector(x, v)))[0])
 
     def _why_off_space(self, x, residual):
         if (

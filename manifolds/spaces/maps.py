@@ -71,16 +71,16 @@ class SpaceMaps(metaclass=ListedABCMeta):
         return jnp.abs(x - y).max(axis=self._axes) / jnp.maximum(jnp.abs(y).max(axis=self._axes), 1.0)
 
     @property
-    def _n_normal_numbers(self) -> int | None:
-        """Number of normal numbers from which a random point is made, None if it is drawn otherwise."""
+    def _n_gaussian_samples(self) -> int | None:
+        """Number of Gaussian samples from which a random point is made, None if it is drawn otherwise."""
         return self.size if type(self)._random is SpaceMaps._random else None
 
-    def _point_from_normal_numbers(self, w):
-        """Return a random point made of normal numbers, shape (..., normals)."""
+    def _point_from_gaussian_samples(self, w):
+        """Return a random point made of independent Gaussian samples w, shape (..., samples)."""
         return self._project(self.from_vector(w))
 
     def _random(self, key, size):
-        return self._point_from_normal_numbers(jax.random.normal(key, (*size, self._n_normal_numbers or 0)))
+        return self._point_from_gaussian_samples(jax.random.normal(key, (*size, self._n_gaussian_samples or 0)))
 
     def _tangent_basis(self, x):
         """Return a basis of the tangent space, orthonormal as flat arrays, shape (..., dim, size).
@@ -173,8 +173,8 @@ class SpaceMaps(metaclass=ListedABCMeta):
     def _divergence_terms(self, x, pair_with_field):
         """Return ``<E_i, nabla_{E_i} X>`` over a frame E, shape (dim, ...): the divergence of X is the sum over i.
 
-        ``rows(y, alpha)`` returns the product of a covector alpha at y with the field X, or with each of several
-        fields.
+        ``pair_with_field(y, alpha)`` returns the product of a covector alpha at y with the field X, or with each of
+        several fields.
         """
 
         def pairing_along_geodesic(t, e):
@@ -189,9 +189,9 @@ class SpaceMaps(metaclass=ListedABCMeta):
                 f"{self.name} has no geodesics, along which divergences are computed. Implement _exp, _log and "
                 "_transport"
             )
-        rows_along = pairing_along_geodesic if self.has_geodesics else pairing_along_line
+        pairing_along = pairing_along_geodesic if self.has_geodesics else pairing_along_line
         frame = jnp.moveaxis(self._frame(x), -1 - len(self.shape), 0)
-        return jax.vmap(lambda e: jax.jvp(lambda t: rows_along(t, e), (0.0,), (1.0,))[1])(frame)
+        return jax.vmap(lambda e: jax.jvp(lambda t: pairing_along(t, e), (0.0,), (1.0,))[1])(frame)
 
     def _norm(self, x, v):
         return safe_sqrt(self._inner(x, v, v))
@@ -342,6 +342,7 @@ class SpaceMaps(metaclass=ListedABCMeta):
         return jnp.expand_dims(v, -1 - len(self.shape))
 
     def _call_compiled(self, method_name: str, *arrays, static: tuple = ()):
+        """Call a method in a compiled program; small calls are compiled without optimisation."""
         is_small = sum(np.size(array) for array in arrays) + np.prod(static) * self.size <= MAX_UNOPTIMIZED_SIZE
         skip_optimization = is_small and not any(
             is_traced(array) for array in arrays

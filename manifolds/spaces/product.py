@@ -111,14 +111,14 @@ class Product(Space):
         return self.random(key, size)
 
     @property
-    def _n_normal_numbers(self):
-        numbers = [factor._n_normal_numbers for factor in self.factors]
+    def _n_gaussian_samples(self):
+        numbers = [factor._n_gaussian_samples for factor in self.factors]
         return None if None in numbers else sum(n for n in numbers if n is not None)
 
-    def _point_from_normal_numbers(self, w):
-        ends = np.cumsum([factor._n_normal_numbers or 0 for factor in self.factors])[:-1]
+    def _point_from_gaussian_samples(self, w):
+        ends = np.cumsum([factor._n_gaussian_samples or 0 for factor in self.factors])[:-1]
         pairs = zip(self.factors, jnp.split(w, ends, axis=-1), strict=True)
-        return self.join(*(factor._point_from_normal_numbers(factor_normals) for factor, factor_normals in pairs))
+        return self.join(*(factor._point_from_gaussian_samples(factor_normals) for factor, factor_normals in pairs))
 
     def _restore(self, x):
         return self._apply_and_join("_restore", x)
@@ -315,11 +315,11 @@ class Power(Space):
         return self.base.is_quotient
 
     @property
-    def _n_normal_numbers(self):
-        return None if self.base._n_normal_numbers is None else self.count * self.base._n_normal_numbers
+    def _n_gaussian_samples(self):
+        return None if self.base._n_gaussian_samples is None else self.count * self.base._n_gaussian_samples
 
-    def _point_from_normal_numbers(self, w):
-        return self.base._point_from_normal_numbers(w.reshape(*w.shape[:-1], self.count, -1))
+    def _point_from_gaussian_samples(self, w):
+        return self.base._point_from_gaussian_samples(w.reshape(*w.shape[:-1], self.count, -1))
 
     _restore = forward_to("base")
     _project_tangent = forward_to("base")

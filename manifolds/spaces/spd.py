@@ -81,10 +81,10 @@ class SPD(PositiveDefinite):
         return symmetrize(x)
 
     @property
-    def _n_normal_numbers(self):
+    def _n_gaussian_samples(self):
         return self.dim
 
-    def _point_from_normal_numbers(self, w):
+    def _point_from_gaussian_samples(self, w):
         return symmetrize(expm(jnp.einsum("...a,aij->...ij", 0.5 * w, self._basis)))
 
     def _project_tangent(self, x, w):
@@ -110,15 +110,15 @@ class SPD(PositiveDefinite):
         return symmetrize(half @ half.swapaxes(-1, -2))  # positive definite by its form
 
     def _log(self, x, y):
-        return _congruence(cholesky(x), self._log_moved_to_identity(x, y))
+        return _congruence(cholesky(x), self._log_transported_to_identity(x, y))
 
-    def _log_moved_to_identity(self, x, y):
-        """Return the logarithm of y at x, carried by the isometry that takes x to the identity."""
+    def _log_transported_to_identity(self, x, y):
+        """Return the logarithm of y at x, transported by the isometry that takes x to the identity."""
         inverse_factor = self._inverse_factor(x)
         return spd_log(_congruence(inverse_factor, y), _congruence(inverse_factor, y - x))
 
     def _squared_distance(self, x, y):
-        v = self._log_moved_to_identity(x, y)
+        v = self._log_transported_to_identity(x, y)
         return self._pair(v, v)
 
     def _transport(self, x, v, u):
@@ -202,10 +202,10 @@ class Correlation(PositiveDefinite):
         return self.to_vector(jnp.abs(x))
 
     @property
-    def _n_normal_numbers(self):
+    def _n_gaussian_samples(self):
         return 2 * self.n**2
 
-    def _point_from_normal_numbers(self, w):
+    def _point_from_gaussian_samples(self, w):
         rows = w.reshape(*w.shape[:-1], self.n, 2 * self.n)
         return self._project(rows @ rows.swapaxes(-1, -2))
 

@@ -90,7 +90,7 @@ def _traced_mean(space: Space, x: jax.Array, w: jax.Array) -> jax.Array:
     def mean_log(mean, x, w):
         return jnp.tensordot(w, space.log(mean, x), axes=1)
 
-    def iterate(state):
+    def karcher_step(state):
         mean, _, min_step_length, n_stalled, count = state
         step = mean_log(mean, points, weights)
         step_length = space.norm(mean, step)
@@ -106,7 +106,7 @@ def _traced_mean(space: Space, x: jax.Array, w: jax.Array) -> jax.Array:
     first_mean = space.project(jnp.tensordot(weights, points, axes=1))
     first_mean = jnp.where(jnp.isfinite(first_mean).all(), first_mean, points[0])
     start = first_mean, jnp.inf * jnp.ones(()), jnp.inf * jnp.ones(()), jnp.zeros((), int), jnp.zeros((), int)
-    end = jax.lax.while_loop(lambda state: ~is_at_rest(state) & (state[-1] < MAX_ITERATIONS), iterate, start)
+    end = jax.lax.while_loop(lambda state: ~is_at_rest(state) & (state[-1] < MAX_ITERATIONS), karcher_step, start)
     mean = jnp.where(is_at_rest(end), end[0], jnp.nan)
 
     def mean_log_coordinates(c, x, w):

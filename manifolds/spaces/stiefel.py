@@ -23,7 +23,7 @@ from ..matrices.linear import (
 )
 from ..matrices.spectral import spectral
 from ..matrices.symmetric import eigh, orthonormal_columns, polar, symmetrize
-from .base import CUT_MARGIN, Space, register
+from .base import CUT_MARGIN, MIN_CUT_ANGLE, Space, register
 from .maps import inner_by_flat, squared_distance_with_cut_locus
 
 _MAX_NEWTON_STEPS = 30
@@ -107,7 +107,7 @@ class Stiefel(Space):
     def _constraint_rounding_scales(self, x):
         return 2.0 * (_transpose_matrix(jnp.abs(x)) @ jnp.abs(x))[..., *np.triu_indices(self.p)]
 
-    def _point_from_normal_numbers(self, w):
+    def _point_from_gaussian_samples(self, w):
         return orthonormal_columns(self.from_vector(w))
 
     def _project_tangent(self, x, w):
@@ -303,21 +303,24 @@ class Grassmann(Space):
         """Return the projector onto the eigenvectors of the p largest eigenvalues."""
         x = symmetrize(x)
         values = jnp.sort(eigh(jax.lax.stop_gradient(x))[0], axis=-1)
-        upper, lower = values[..., self.n - self.p], values[..., self.n - self.p - 1]
-        midpoint, spread = 0.5 * (upper + lower), jnp.maximum(values[..., -1] - lower, upper - values[..., 0])
-        sign = (x - midpoint[..., None, None] * np.eye(self.n)) / spread[..., None, None]
+        upper, lower_values = values[..., self.n - self.p], values[..., self.n - self.p - 1]
+        midpoint, eigenvalue_gap = (
+            0.5 * (upper + lower_values),
+            jnp.maximum(values[..., -1] - lower_values, upper - values[..., 0]),
+        )
+        sign = (x - midpoint[..., None, None] * np.eye(self.n)) / eigenvalue_gap[..., None, None]
         sign = jax.lax.fori_loop(0, _SIGN_NEWTON_STEPS, lambda _, y: 1.5 * y - 0.5 * y @ y @ y, sign)
         return jnp.where(
-            (upper - lower > _MIN_EIGENVALUE_GAP * spread)[..., None, None],
+            (upper - lower_values > _MIN_EIGENVALUE_GAP * eigenvalue_gap)[..., None, None],
             symmetrize(0.5 * (np.eye(self.n) + sign)),
             jnp.nan,
         )
 
     @property
-    def _n_normal_numbers(self):
+    def _n_gaussian_samples(self):
         return self.n * self.p
 
-    def _point_from_normal_numbers(self, w):
+    def _point_from_gaussian_samples(self, w):
         return self.subspace(w.reshape(*w.shape[:-1], self.n, self.p))
 
     def _project_tangent(self, x, w):
@@ -420,7 +423,7 @@ def _angle_over_sine(half_angle_sine_squared):
     sine_squared = jnp.where(
         use_series,
         0.25,
-        jnp.where(half_angle_sine_squared < 0.5 - 0.5 * (math.pi / 2 * CUT_MARGIN), half_angle_sine_squared, jnp.nan),
+        jnp.where(half_angle_sine_squared < 0.5 - 0.5 * MIN_CUT_ANGLE, half_angle_sine_squared, jnp.nan),
     )
     cosine_squared = 1.0 - sine_squared
     return jnp.where(

@@ -93,6 +93,8 @@ class ContactStructure(Module):
         return self._bracket(self.bivector_sharp, f, g)
 
     def _bracket(self, sharp: Callable, f: Callable, g: Callable) -> Callable:
+        """Return the function ``sharp(df) . dg``, the bracket of the bivector that ``sharp`` applies."""
+
         def value(x):
             x = real_components(x, self.dim, "x")
             return jnp.dot(sharp(x, jax.grad(f)(x)), jax.grad(g)(x))

@@ -21,7 +21,7 @@ from .._pytree_module import Module, forward_to
 from ..algebras.bracket_algebra import BracketAlgebra
 from ..algebras.lie_algebra import LieAlgebra
 from ..errors import ParameterError, ShapeError
-from ..matrices.linear import adjoint, cayley_rate, conjugate_by_stages
+from ..matrices.linear import adjoint, conjugate_by_collocation_stages, inverse_dcayley
 
 
 class PoissonStructure(Module):
@@ -110,16 +110,16 @@ class PoissonStructure(Module):
 
     def jacobi_residual(self, x) -> jax.Array:
         """Return the largest ``|Pi_il d_l Pi_jk + cyclic|`` at the point x: zero for a Poisson tensor [BFM §2.1]."""
-        x = real_components(x, self._dimension(x), "x")
+        x = real_components(x, self._dimension_at(x), "x")
         tensor, derivative = self.tensor(x), jax.jacfwd(self.tensor)(x)
         term = jnp.einsum("il,jkl->ijk", tensor, derivative)
         return jnp.max(jnp.abs(term + term.transpose(1, 2, 0) + term.transpose(2, 0, 1)))
 
     def rank(self, x) -> int:
         """Return the rank of Pi(x): the dimension of the symplectic leaf through x."""
-        return int(np.linalg.matrix_rank(np.asarray(self.tensor(real_components(x, self._dimension(x), "x")))))
+        return int(np.linalg.matrix_rank(np.asarray(self.tensor(real_components(x, self._dimension_at(x), "x")))))
 
-    def _dimension(self, x) -> int:
+    def _dimension_at(self, x) -> int:
         return jnp.shape(x)[-1] if self.dim is None else self.dim
 
 
@@ -142,7 +142,7 @@ class LiePoisson(PoissonStructure):
         if skew_matrices is None:
             return None
         basis, dual = skew_matrices
-        conjugates = conjugate_by_stages(-jnp.tensordot(alpha, basis, 1), jnp.tensordot(x, dual, 1), A)
+        conjugates = conjugate_by_collocation_stages(-jnp.tensordot(alpha, basis, 1), jnp.tensordot(x, dual, 1), A)
         return jnp.einsum("sij,aji->sa", conjugates, basis).real
 
     def leaf_covector_rate(self, covector, alpha) -> jax.Array | None:
@@ -151,7 +151,7 @@ class LiePoisson(PoissonStructure):
             return None
         basis, dual = skew_matrices
         k, b = (-jnp.tensordot(v, basis, 1) for v in (covector, alpha))
-        return -jnp.einsum("ij,aji->a", cayley_rate(k, b), dual).real
+        return -jnp.einsum("ij,aji->a", inverse_dcayley(k, b), dual).real
 
 
 @functools.lru_cache(maxsize=64)
@@ -235,7 +235,7 @@ class PoissonBySharp(PoissonStructure):
     def sharp(self, x, alpha) -> jax.Array: ...
 
     def tensor(self, x) -> jax.Array:
-        return jax.vmap(lambda axis: self.sharp(x, axis), out_axes=1)(jnp.eye(self._dimension(x)))
+        return jax.vmap(lambda axis: self.sharp(x, axis), out_axes=1)(jnp.eye(self._dimension_at(x)))
 
 
 class PoissonMap(PoissonBySharp):
@@ -356,15 +356,15 @@ class DensityMatrices(PoissonBySharp):
     def stages_on_leaf(self, x, alpha, A) -> jax.Array:
         """Return ``U_i rho U_i^H``, with stages U_i by A of ``U' = -i H U`` from the identity; eigenvalues are
         conserved."""
-        return self.vector(conjugate_by_stages(-1j * self.matrix(alpha), self.matrix(x), A))
+        return self.vector(conjugate_by_collocation_stages(-1j * self.matrix(alpha), self.matrix(x), A))
 
     def leaf_covector_rate(self, covector, alpha) -> jax.Array:
-        return self.vector(1j * cayley_rate(-1j * self.matrix(covector), -1j * self.matrix(alpha)))
+        return self.vector(1j * inverse_dcayley(-1j * self.matrix(covector), -1j * self.matrix(alpha)))
 
 
 @functools.lru_cache(maxsize=64)
 def _coordinate_indices(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return index arrays between coordinates and matrix entries, with the factors.
+    """Return the index arrays, with factors, that convert between coordinates and matrix entries.
 
     The first array has the coordinate of the real and the imaginary part of each entry, the second the factors of these
     parts, the third the position of each coordinate among the parts.
@@ -431,21 +431,21 @@ class ExtendedPhaseSpace(PoissonStructure):
 
     def tensor(self, x) -> jax.Array:
         del x  # constant
-        return jnp.asarray(np.eye(self.dim)[self._conjugate] * self._sign[:, None])
+        return jnp.asarray(np.eye(self.dim)[self._conjugate_indices] * self._conjugate_signs[:, None])
 
     def sharp(self, x, alpha) -> jax.Array:
         del x
-        return self._sign * alpha[self._conjugate]
+        return self._conjugate_signs * alpha[self._conjugate_indices]
 
     @property
-    def _conjugate(self) -> np.ndarray:
+    def _conjugate_indices(self) -> np.ndarray:
         q, p, _, _ = self.state_indices
         partner = np.arange(self.dim)
         partner[q], partner[p] = p, q
         return partner
 
     @property
-    def _sign(self) -> np.ndarray:
+    def _conjugate_signs(self) -> np.ndarray:
         q, p, _, _ = self.state_indices
         sign = np.zeros(self.dim)
         sign[q], sign[p] = 1.0, -1.0

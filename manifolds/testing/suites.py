@@ -141,11 +141,12 @@ def check_algebra(g: LieAlgebra, degree: int = 3, seed: int = 0) -> Report:
             "Cartan involution: automorphism", automorphism_residual, 100 * unit * np.abs(theta).max() ** 2, 1e-9
         )
         suite.check_true("Cartan involution: -kappa(x, theta x) > 0", np.linalg.eigvalsh(-kappa @ theta)[0] > 0.0)
-    _casimirs(suite, g, degree, mu.reshape(-1, g.dim))
+    _check_casimirs(suite, g, degree, mu.reshape(-1, g.dim))
     return suite.report()
 
 
-def _casimirs(suite: Suite, g: LieAlgebra, degree: int, mu: np.ndarray) -> None:
+def _check_casimirs(suite: Suite, g: LieAlgebra, degree: int, mu: np.ndarray) -> None:
+    """Check that the Casimirs up to a degree are invariant at the points mu, and count the independent ones."""
     gradients = []
     for d in range(1, degree + 1):
         with warnings.catch_warnings():

@@ -59,6 +59,16 @@ def test_a_page_shows_what_its_blocks_print_and_draw(page_runner, tmp_path):
     assert (folder / "tutorials-page-3-1.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_figures_left_open_before_a_page_are_not_its_figures(page_runner, tmp_path):
+    import matplotlib.pyplot as plt
+
+    plt.figure()
+    page, folder = build(page_runner, PAGE, tmp_path)
+    assert "two\n3\n" in page
+    assert len(list(folder.glob("*.png"))) == 2
+    assert plt.get_fignums() == []
+
+
 def test_its_notebook_has_the_same(page_runner, tmp_path):
     _, folder = build(page_runner, PAGE, tmp_path)
     notebook = json.loads((folder / "page.ipynb").read_text())

@@ -13,7 +13,7 @@ import numpy as np
 from manifolds._pytree_module import Module
 from manifolds.structures.spins import cross
 
-from ...errors import FunctionError, InputError
+from ...errors import FunctionError, IndexOutOfRangeError, InputError
 from ...tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ...tracing.traced import trace_callables_and_result_shapes
 from ..conditions import checked_numbers, require_condition
@@ -159,6 +159,8 @@ def checked_spin_torque(torque, sites: tuple[int, ...]) -> tuple[Callable, ...]:
 
     try:
         functions, values = trace_callables_and_result_shapes(terms, evaluate_terms, (), shape)
+    except IndexOutOfRangeError as error:
+        raise error.with_function(f"the torque, at spins of shape {shape},") from None
     except TRACE_ERRORS as error:
         what = f"the torque could not be evaluated on spins of shape {shape}"
         raise FunctionError(trace_error_message(what, error)) from error

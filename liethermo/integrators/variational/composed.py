@@ -42,7 +42,9 @@ class ComposedVariational(MethodWrapper):
         assert isinstance(system, ComposedSystem)
         maps = self.maps
         if len(maps) == 1:
-            return system.vector_field(x + (compensation + h * component_step_fractions(system, maps[0]) * k[0]))[None]
+            return system.vector_field(x + (compensation + h * component_evaluation_fractions(system, maps[0]) * k[0]))[
+                None
+            ]
         (q, p, S, _), total = system.poisson.state_indices, sum(map.weight for map in maps)
         map_weights, end_fractions = [map.weight / total for map in maps], [1.0 - map.alpha for map in maps]
 
@@ -54,7 +56,7 @@ class ComposedVariational(MethodWrapper):
 
         # the points of the maps, each with its own momentum
         displacements = [
-            (h * component_step_fractions(system, map) * k[0]).at[p].set(h * row[p])
+            (h * component_evaluation_fractions(system, map) * k[0]).at[p].set(h * row[p])
             for map, row in zip(maps, k[1:], strict=True)
         ]
         points = [x + (compensation + d) for d in displacements]
@@ -93,7 +95,7 @@ class ComposedVariational(MethodWrapper):
         return np.multiply.outer(np.asarray(theta, dtype=float), np.eye(self.stages)[0])
 
 
-def component_step_fractions(system: ComposedSystem, map: FiniteDifference) -> np.ndarray:
+def component_evaluation_fractions(system: ComposedSystem, map: FiniteDifference) -> np.ndarray:
     """Return, for each component of a composed system, the fraction of the step at which the map evaluates it."""
     q, p, _, _ = system.poisson.state_indices
     fractions = np.full(system.dim, map.beta)
@@ -101,6 +103,8 @@ def component_step_fractions(system: ComposedSystem, map: FiniteDifference) -> n
     return fractions
 
 
-def _momentum_hessian(system: ComposedSystem, x, p) -> jax.Array:
-    """Return ``H_pp``, the inverse of the mass matrix of all bodies."""
-    return jax.jacfwd(lambda y: system.energy.gradient(x.at[p].set(y))[p])(x[p])
+def _momentum_hessian(system: ComposedSystem, x, momentum_indices) -> jax.Array:
+    """Return ``H_pp``, the second derivatives of the energy by the momenta: the inverse of the mass matrix."""
+    return jax.jacfwd(lambda y: system.energy.gradient(x.at[momentum_indices].set(y))[momentum_indices])(
+        x[momentum_indices]
+    )

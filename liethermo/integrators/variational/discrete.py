@@ -161,6 +161,7 @@ class DiscreteSystem(Module):
     # -- in difference quotients, per unit of time ------------------------------------------------------------------
 
     def _points_of_maps(self, maps, pair: Pair) -> Iterator[MapPoint]:
+        """Yield the point at which each map evaluates the functions, with its weight in the mean."""
         total = sum(map.weight for map in maps)
         for map in maps:
             q, v = self._position_and_velocity(map, pair.q0, pair.V)
@@ -172,34 +173,34 @@ class DiscreteSystem(Module):
             return map.position(q0, V, self.h), map.velocity(q0, V, self.h)
         return self.curve.position_and_velocity(map.alpha, q0, V, self.h)
 
-    def _split_force(self, map: FiniteDifference, pair: Pair, F) -> tuple[jax.Array, jax.Array]:
-        """Return a force at the map's point as forces on q_0 and on q_1: ``D_1 q·F``, ``D_2 q·F``."""
+    def _split_force_between_ends(self, map: FiniteDifference, pair: Pair, F) -> tuple[jax.Array, jax.Array]:
+        """Return the forces ``D_1 q·F`` on q_0 and ``D_2 q·F`` on q_1 that represent a force F at the map's point."""
         if self.curve is None and type(map).position is FiniteDifference.position:
             return (1.0 - map.alpha) * F, map.alpha * F
         _, pullback = jax.vjp(lambda q0, V: self._position_and_velocity(map, q0, V)[0], pair.q0, pair.V)
         force_on_q0, force_on_V = pullback(F)  # V grows with q_1 at fixed q_0, at the rate 1/h
         return force_on_q0 - force_on_V / self.h, force_on_V / self.h
 
-    def action(self, q0, V, S0, s) -> jax.Array:
-        """Return ``L_d / h``."""
+    def mean_lagrangian(self, q0, V, S0, s) -> jax.Array:
+        """Return ``L_d / h``, the weighted mean of the Lagrangian over the points of its maps."""
         points = self._points_of_maps(self.lagrangian_maps, Pair(q0, V, S0, s))
         return _sum_arrays([p.weight * self.system.lagrangian_value(p.q, p.v, p.S) for p in points])
 
-    def forces_over_step(self, pair: Pair, friction: bool = True, external: bool = True) -> tuple[jax.Array, jax.Array]:
+    def mean_end_forces(self, pair: Pair, friction: bool = True, external: bool = True) -> tuple[jax.Array, jax.Array]:
         """Return the forces at the two ends of a step, ``F^-_d / h`` and ``F^+_d / h``, shape (n,) each."""
         force_at_start = force_at_end = jnp.zeros_like(pair.V)
         for p in self._points_of_maps(self.force_maps, pair):
             F = jnp.zeros_like(p.v)
             F = F + self.system.friction_force(*p[2:]) if friction else F
             F = F + self.system.external_force(*p[2:]) if external else F
-            force_minus, force_plus = self._split_force(p.map, pair, p.weight * F)
+            force_minus, force_plus = self._split_force_between_ends(p.map, pair, p.weight * F)
             force_at_start, force_at_end = force_at_start + force_minus, force_at_end + force_plus
         return force_at_start, force_at_end
 
     def momentum_residual(self, p0, pair: Pair) -> jax.Array:
         """Return the residual of ``p_0 = -D_1 L_d - F^-_d``, (3.12) with the momentum of the last step, shape (n,)."""
-        dL_dq, dL_dV = jax.grad(self.action, argnums=(0, 1))(*pair)
-        return p0 - dL_dV + self.h * (dL_dq + self.forces_over_step(pair)[0])
+        dL_dq, dL_dV = jax.grad(self.mean_lagrangian, argnums=(0, 1))(*pair)
+        return p0 - dL_dV + self.h * (dL_dq + self.mean_end_forces(pair)[0])
 
     def motion_residual(self, p0, pair: Pair, mass: float | jax.Array = 1.0) -> jax.Array:
         """Return the momentum residual, shape (n,); on a manifold along Q, plus the distance of q_1 from Q.
@@ -215,13 +216,13 @@ class DiscreteSystem(Module):
             pair.q0, constraint_rate
         )
 
-    def force(self, p0, pair: Pair) -> jax.Array:
-        """Return ``(p_1 - p_0) / h = (D_1 L_d + D_2 L_d + F^-_d + F^+_d) / h``, shape (n,).
+    def momentum_slope(self, p0, pair: Pair) -> jax.Array:
+        """Return the slope of the momentum ``(p_1 - p_0) / h = (D_1 L_d + D_2 L_d + F^-_d + F^+_d) / h``, shape (n,).
 
-        On a manifold it is the part tangent to the manifold.
+        On a manifold it is the component tangent to the manifold.
         """
-        force_at_start, force_at_end = self.forces_over_step(pair)
-        force = jax.grad(self.action)(*pair) + (force_at_start + force_at_end)
+        force_at_start, force_at_end = self.mean_end_forces(pair)
+        force = jax.grad(self.mean_lagrangian)(*pair) + (force_at_start + force_at_end)
         return force if self.curve is None else force - self.momentum_residual(p0, pair) / self.h
 
     def constraint_residual(self, pair: Pair) -> jax.Array:
@@ -235,7 +236,7 @@ class DiscreteSystem(Module):
 
     def work_and_heat_rates(self, pair: Pair) -> tuple[jax.Array, jax.Array]:
         """Return the work and the heat received from outside, per unit of time."""
-        force_at_start, force_at_end = self.forces_over_step(pair, friction=False)
+        force_at_start, force_at_end = self.mean_end_forces(pair, friction=False)
         heat = _sum_arrays(
             [p.weight * self.system.heating(*p[2:]) for p in self._points_of_maps(self.constraint_maps, pair)]
         )
@@ -250,19 +251,20 @@ class DiscreteSystem(Module):
     # -- as in the paper ----------------------------------------------------------------------------------------------
 
     def pair(self, q0, q1, S0, S1) -> Pair:
+        """Return two points in the coordinates of the step equations, (q_0, V, S_0, s)."""
         return Pair(q0, (q1 - q0) / self.h, S0, (S1 - S0) / self.h)
 
     def lagrangian(self, q0, q1, S0, S1) -> jax.Array:
-        """Return ``L_d`` [GBY 3.10]."""
-        return self.h * self.action(*self.pair(q0, q1, S0, S1))
+        """Return the discrete Lagrangian ``L_d`` of a step, shape () [GBY 3.10]."""
+        return self.h * self.mean_lagrangian(*self.pair(q0, q1, S0, S1))
 
     def forces(self, q0, q1, S0, S1, friction: bool = True, external: bool = True) -> tuple[jax.Array, jax.Array]:
         """Return the discrete forces ``F^-_d`` and ``F^+_d``, impulses of shape (n,) each [GBY Definition 3.2]."""
-        force_at_start, force_at_end = self.forces_over_step(self.pair(q0, q1, S0, S1), friction, external)
+        force_at_start, force_at_end = self.mean_end_forces(self.pair(q0, q1, S0, S1), friction, external)
         return self.h * force_at_start, self.h * force_at_end
 
     def constraint(self, q0, q1, S0, S1) -> jax.Array:
-        """Return ``P_d``, which vanishes for a pair on ``C_K^d`` [GBY 3.8]."""
+        """Return the value ``P_d`` of the discrete constraint, zero for a pair on ``C_K^d``, shape () [GBY 3.8]."""
         return -self.constraint_residual(self.pair(q0, q1, S0, S1))
 
     def momenta(self, q0, q1, S0, S1) -> tuple[jax.Array, jax.Array]:
@@ -273,7 +275,10 @@ class DiscreteSystem(Module):
         return tangential_part(q0, -dL_dq0 - force_minus), tangential_part(q1, dL_dq1 + force_plus)
 
     def momentum_and_constraint_jacobian(self, q0, q1, S0, S1) -> jax.Array:
-        """Return the matrix (3.13), shape (n + 1, n + 1): if it is invertible, q_1 and S_1 determine the step."""
+        """Return the Jacobian (3.13) of momentum and constraint by (q_1, S_1), shape (n + 1, n + 1).
+
+        If it is invertible, the momentum and the constraint determine q_1 and S_1, and so the step.
+        """
 
         def momentum_and_constraint(q1, S1):
             return -self.momenta(q0, q1, S0, S1)[0], self.constraint(q0, q1, S0, S1)
@@ -281,27 +286,32 @@ class DiscreteSystem(Module):
         (A, B), (C, D) = jax.jacfwd(momentum_and_constraint, argnums=(0, 1))(q1, S1)
         return jnp.block([[A, B[:, None]], [C[None], D[None, None]]])
 
-    def reduced_matrix(self, q0, q1, S0, S1) -> jax.Array:
-        """Return the matrix (3.15), shape (n, n): (3.13) is invertible if (3.15) is, and ``D_4 P_d`` is not zero."""
+    def reduced_regularity_matrix(self, q0, q1, S0, S1) -> jax.Array:
+        """Return the Schur complement (3.15) of the Jacobian (3.13), with S_1 eliminated, shape (n, n).
+
+        (3.13) is invertible if (3.15) is, and ``D_4 P_d`` is not zero.
+        """
         matrix = self.momentum_and_constraint_jacobian(q0, q1, S0, S1)
         return matrix[:-1, :-1] - jnp.outer(matrix[:-1, -1], matrix[-1, :-1]) / matrix[-1, -1]
 
     def end_entropy_on_constraint(self, q0, q1, S0) -> jax.Array:
-        """Return S_1 with ``P_d(q_0, q_1, S_0, S_1) = 0``, by Newton steps of a fixed number; differentiable."""
+        """Return S_1 with ``P_d(q_0, q_1, S_0, S_1) = 0``, after NEWTON_STEPS Newton steps; it is differentiable."""
         V = (q1 - q0) / self.h
         return S0 + self.h * newton_iterate(
             lambda s: self.constraint_residual(Pair(q0, V, S0, s)), jnp.zeros(()), NEWTON_STEPS
         )
 
-    def flow(self, q0, q1, S0, S1, steps: int = NEWTON_STEPS) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        """Return the discrete flow on ``C_K^d``, (q_1, q_2, S_1, S_2), after ``steps`` Newton steps [GBY 3.14]."""
+    def flow(
+        self, q0, q1, S0, S1, newton_steps: int = NEWTON_STEPS
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """Return (q_1, q_2, S_1, S_2), the discrete flow on ``C_K^d``, after ``newton_steps`` iterations [GBY 3.14]."""
         p1, start = self.momenta(q0, q1, S0, S1)[1], jnp.append((q1 - q0) / self.h, (S1 - S0) / self.h)
 
         def residual(y):
             pair = Pair(q1, y[:-1], S1, y[-1])
             return jnp.append(self.motion_residual(p1, pair), self.constraint_residual(pair))
 
-        y = newton_iterate(residual, start, steps)
+        y = newton_iterate(residual, start, newton_steps)
         return q1, q1 + self.h * y[:-1], S1, S1 + self.h * y[-1]
 
 

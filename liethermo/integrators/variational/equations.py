@@ -14,7 +14,7 @@ from .discrete import DiscreteSystem, Pair
 
 
 def newton_step(discrete: DiscreteSystem, start_velocity, p0, guess: Pair) -> tuple[jax.Array, jax.Array]:
-    """Return V and s after one step of Newton's method for (3.12) from a guess; from zero if one step is exact."""
+    """Return the velocity V and the entropy slope s after one Newton step for (3.12); exact if (3.12) is affine."""
     n, (q0, V, S0, s) = len(guess.V), guess
     mass = mass_scale(discrete.system, q0, start_velocity, S0)
     is_affine = discrete.curve is None and (
@@ -55,7 +55,7 @@ def _constraint_residual_of_s(fixed_arguments, s):
 
 
 def velocity_slope(system: SimpleClosedSystem, start, end, force, h) -> jax.Array:
-    """Return the slope ``(v_1 - v_0)/h`` of the velocity with the momentum ``p_0 + h force``, by one Newton step.
+    """Return the slope ``(v_1 - v_0)/h``, where v_1 has the momentum ``p_0 + h force``, after one Newton step.
 
     Parameters
     ----------
@@ -67,11 +67,11 @@ def velocity_slope(system: SimpleClosedSystem, start, end, force, h) -> jax.Arra
     affine = polynomial_degree_bound(_momentum_of_v, (system, q1, S1), len(v0)) <= 1
     slope = jnp.zeros_like(v0) if affine else slope
     W, p = jacobian_and_value(lambda v: system.momentum(q1, v, S1), v0 + h * slope)
-    W, residual = _restrict_to_tangents(system, q1, v0 + h * slope, W, (p - p0) / h - force, h)
+    W, residual = _restrict_to_tangent_space(system, q1, v0 + h * slope, W, (p - p0) / h - force, h)
     return slope - newton_correction(W, residual)
 
 
-def _restrict_to_tangents(
+def _restrict_to_tangent_space(
     system: SimpleClosedSystem, q, v, mass_matrix, residual, h=1.0
 ) -> tuple[jax.Array, jax.Array]:
     """Restrict the matrix and the residual (over h) of an equation for a momentum to velocities v tangent to Q."""
@@ -108,7 +108,7 @@ def velocity_from_momentum(system: SimpleClosedSystem, q, S, p, velocity_guess):
         return system.momentum(q, v, S) - p
 
     def tangent_jacobian_and_value(function, v):
-        return _restrict_to_tangents(system, q, v, *jacobian_and_value(function, v))
+        return _restrict_to_tangent_space(system, q, v, *jacobian_and_value(function, v))
 
     v = newton_iterate(momentum_residual, velocity_guess, 20, tangent_jacobian_and_value)
     residual = system.tangential_part(q, momentum_residual(v))

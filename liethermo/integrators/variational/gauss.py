@@ -63,14 +63,14 @@ class VariationalGauss(GaussMethod):
         (q0, v0, S0, t0), V, s = system.split_state(start), k[:, :n], k[:, 2 * n]
         q, S, t, p0 = q0 + h * (A @ V), S0 + h * (A @ s), t0 + h * c, system.momentum(q0, v0, S0)
 
-        def forces(q, V, S, t):
+        def node_forces_and_rates(q, V, S, t):
             dL_dq, p, minus_T = jax.grad(system.lagrangian_value, argnums=(0, 1, 2))(q, V, S)
             friction, external = system.friction_force(q, V, S, t), system.external_force(q, V, S, t)
             power, T = system.heating(q, V, S, t), jnp.where(minus_T < 0.0, -minus_T, jnp.nan)
             energy_rates = jnp.stack([jnp.dot(external, V), power])
             return dL_dq + friction + external, p, (power - jnp.dot(friction, V)) / T, energy_rates
 
-        force, p, s, node_rates = jax.vmap(forces)(q, V, S, t)
+        force, p, s, node_rates = jax.vmap(node_forces_and_rates)(q, V, S, t)
         W = jax.vmap(jax.jacfwd(system.momentum, argnums=1))(q, V, S)
         momentum_residual = p0 + h * (A @ force) - p
         V = V + jax.vmap(lambda W, r: solve(W, r[:, None])[:, 0])(W, momentum_residual)

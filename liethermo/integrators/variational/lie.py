@@ -163,6 +163,7 @@ class _LieStep(NamedTuple):
     t: jax.Array
 
     def _midpoint(self, y) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return the velocity xi, and the entropy and the time in the middle of the step."""
         return y[:-1], self.S0 + 0.5 * self.h * y[-1], self.t + 0.5 * self.h
 
     def momenta(self, y) -> tuple[jax.Array, jax.Array]:
@@ -201,7 +202,10 @@ class _LieStep(NamedTuple):
 
 @jit_cached
 def _group_increments(method: LieVariational, system: EulerPoincareClosedSystem, x, h):
-    """Return ``tau(h xi_k)`` of every step, with xi_k from the momentum before it, shape (steps, m, m)."""
+    """Return the group increments ``tau(h xi_k)`` of all steps of a run, shape (steps, m, m).
+
+    The velocity xi_k of a step follows from the momentum at its start.
+    """
     tau = cayley if method.tau == "cayley" else exp
 
     def group_increment(x0, x1):

@@ -141,7 +141,7 @@ class VariationalIntegrator(OneStepMethod):
 
     @property
     def _has_symmetric_curves(self) -> bool:
-        """True if the curves on a manifold are the same from both ends."""
+        """True if the curve from q_1 to q_0 on a manifold is that from q_0 to q_1, run backward."""
         return self.retraction in SYMMETRIC_RETRACTION_NAMES or isinstance(self.retraction, SYMMETRIC_RETRACTION_TYPES)
 
     uses_charts = False
@@ -216,7 +216,7 @@ class VariationalIntegrator(OneStepMethod):
         V, s = newton_step(discrete, v0, p0, Pair(q0, k[0, :n], S0, k[0, 2 * n]))
         pair = Pair(q0, V, S0, s)
         v_dot = velocity_slope(
-            system, (q0, v0, S0, p0), (q0 + h * V, k[0, n : 2 * n], S0 + h * s), discrete.force(p0, pair), h
+            system, (q0, v0, S0, p0), (q0 + h * V, k[0, n : 2 * n], S0 + h * s), discrete.momentum_slope(p0, pair), h
         )
         ledger = jnp.stack([*discrete.work_and_heat_rates(pair), jnp.ones(())])[: system.dim - (2 * n + 1)]
         return jnp.concatenate([V, v_dot, s[None], ledger])[None]
@@ -341,13 +341,14 @@ SYMMETRIC_RETRACTION_TYPES = (
 """Classes of retractions whose line through two points is the same in the charts around both."""
 
 
-def require_simple_closed(system: System, name: str) -> None:
+def require_simple_closed(system: System, method_name: str) -> None:
+    """Raise InputError, with the name of the method, unless the system is simple closed and on R^n."""
     if isinstance(system, EmbeddedSystem):
         raise InputError(
-            f"{name} runs only on R^n. On a manifold use lt.VariationalIntegrator or a metriplectic method"
+            f"{method_name} runs only on R^n. On a manifold use lt.VariationalIntegrator or a metriplectic method"
         )
     if not isinstance(system, SimpleClosedSystem):
-        raise InputError(f"{name} needs an lt.SimpleClosedSystem, got a {kind_or_class_name(system)}")
+        raise InputError(f"{method_name} needs an lt.SimpleClosedSystem, got a {kind_or_class_name(system)}")
 
 
 SCHEMES: dict[str, tuple[FiniteDifference, ...]] = {
@@ -358,24 +359,26 @@ SCHEMES: dict[str, tuple[FiniteDifference, ...]] = {
 """The finite difference maps of the schemes of GBY §3.3, by name."""
 
 
-def _checked_maps(maps: Maps, what: str) -> tuple[FiniteDifference, ...]:
+def _checked_maps(maps: Maps, argument_name: str) -> tuple[FiniteDifference, ...]:
+    """Return one map, several maps, or the maps of a named scheme as a tuple; raise InputError for anything else."""
     map_or_maps = SCHEMES.get(maps, ()) if isinstance(maps, str) else maps
     map_tuple: tuple[Any, ...] = tuple(map_or_maps) if isinstance(map_or_maps, Sequence) else (map_or_maps,)
     if not map_tuple or not all(isinstance(map, FiniteDifference) for map in map_tuple):
         raise InputError(
-            f"{what} must be an lt.FiniteDifference, a sequence of them, or one of {', '.join(map(repr, SCHEMES))}, "
-            f"got {maps!r}"
+            f"{argument_name} must be an lt.FiniteDifference, a sequence of them, or one of "
+            f"{', '.join(map(repr, SCHEMES))}, got {maps!r}"
         )
     return map_tuple
 
 
 def _is_symmetric_set(maps: tuple[FiniteDifference, ...]) -> bool:
+    """Return True if the reversed maps are the same maps with the same multiplicities."""
     return Counter(maps) == Counter(map.reversed_map() for map in maps)
 
 
 @jit_cached
 def _constraint_residual(discrete: DiscreteSystem, q0, q1, S0, S1):
-    """Return the size of the constraint residual, and its scale: the heat plus the work of the step."""
+    """Return the absolute residual of the constraint ``P_d``, and its scale: the heat plus the work of the step."""
     pair = discrete.pair(q0, q1, S0, S1)
     residual, slope = jax.jvp(lambda s: discrete.constraint_residual(pair._replace(s=s)), (pair.s,), (jnp.ones(()),))
     heat = jnp.abs(slope * pair.s)
@@ -384,6 +387,8 @@ def _constraint_residual(discrete: DiscreteSystem, q0, q1, S0, S1):
 
 @jit_cached
 def _step_energies(method: VariationalIntegrator, system: SimpleClosedSystem, h, start_states, end_states):
+    """Return the energy of each step between the start and the end states, at the points of the scheme."""
+
     def step_energy(x, y):
         (q0, _, S0, t), (q1, _, S1, _) = system.split_state(x), system.split_state(y)
         discrete = method.discrete_system(system, h, t)
@@ -394,6 +399,7 @@ def _step_energies(method: VariationalIntegrator, system: SimpleClosedSystem, h,
 
 @jit_cached
 def _regularity_matrix(discrete: DiscreteSystem, q0, q1, S0, S1):
+    """Return the Jacobian (3.13) of momentum and constraint, shape (n + 1, n + 1), by a compiled program."""
     return discrete.momentum_and_constraint_jacobian(q0, q1, S0, S1)
 
 

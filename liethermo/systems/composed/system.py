@@ -16,7 +16,7 @@ from manifolds._arrays import is_traced
 from manifolds._pytree_module import Module
 from manifolds.structures.poisson import StateIndices
 
-from ...dissipation.base import Dissipation, nondecreasing_if
+from ...dissipation.base import Dissipation, nondecreasing_law_if
 from ...dissipation.bodies import (
     ContactFriction,
     Drag,
@@ -271,7 +271,7 @@ class ComposedSystem(System):
         if bodies:
             terms.append(
                 ContactFriction(
-                    bodies, law=nondecreasing_if(self._friction_surely_produces_entropy(energy, structure, bodies))
+                    bodies, law=nondecreasing_law_if(self._friction_surely_produces_entropy(energy, structure, bodies))
                 )
             )
         rates = [_diagonal_friction(body) for body in self.subsystems]

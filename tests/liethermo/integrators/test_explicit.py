@@ -352,7 +352,7 @@ def remove_corrections(method):
 
     class UncorrectedMethod(type(method)):
         def slopes(self, system, x, compensation, h, k):
-            laws = self._laws(system)
+            laws = self._laws_to_hold(system)
             rates = lambda y: self.field_and_law_rates(system, laws, y)  # noqa: E731
             d, _, error, interpolation_rows = self.base_step(rates, False, x, compensation, h)
             return jnp.stack([d / h, error, jnp.zeros_like(x), k[StepRow.INITIAL_LEVELS], *interpolation_rows])

@@ -47,6 +47,17 @@ def test_expressions_have_the_values_of_the_functions():
     assert float(symbolic.entropy.subs(numbers)) == pytest.approx(float(GENERAL.entropy.value(at)), rel=1e-14)
 
 
+def test_a_mask_of_constants_has_expressions():
+    """A mask that is an array of booleans is a constant of the program: its entries are SymPy's true and false."""
+    mask = np.array([True, False, True])
+    body = lt.LiePoissonSystem(mf.so(3), lambda m: jnp.sum(jnp.where(mask & (m > 0.0), m**2, 2.0 * m**2)))
+    symbolic = lt.sympy.expressions(body)
+    for state in ([0.3, 0.4, -0.7], [-0.3, -0.4, 0.7]):
+        expected = sum(x**2 if is_masked and x > 0.0 else 2.0 * x**2 for x, is_masked in zip(state, mask, strict=True))
+        numbers = dict(zip(symbolic.variables, state, strict=True))
+        assert float(symbolic.energy.subs(numbers)) == pytest.approx(expected, rel=1e-14)
+
+
 def test_an_energy_from_sympy_runs():
     a, b, c = x = sympy.symbols("a b c", real=True)
     g = mf.so(3)

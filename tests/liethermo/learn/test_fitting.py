@@ -11,9 +11,9 @@ import liethermo as lt
 import manifolds as mf
 from liethermo.learn import training
 from liethermo.learn.data import Trajectory, spline_states_and_rates
-from liethermo.learn.fitting import checked_noise
+from liethermo.learn.fitting import checked_noise_std
 from liethermo.learn.losses import differentiable_stepper
-from liethermo.learn.observation import make_observation, states_matching_rates
+from liethermo.learn.observation import make_observation, states_matching_observations_and_rates
 
 from . import cases
 
@@ -240,7 +240,7 @@ def test_the_first_states_show_the_attitudes_and_move_as_they_do():
     observation = make_observation(body, None, lambda x, R: R)
     run = differentiable_stepper(body, lt.MetriplecticRungeKutta(4), 1, True)[0]
     smoothed_data = spline_states_and_rates(Trajectory(t, R.reshape(-1, 9)), None)
-    states = states_matching_rates(observation, run, [(t, *smoothed_data)], np.ones(9), 1.0, None)[0]
+    states = states_matching_observations_and_rates(observation, run, [(t, *smoothed_data)], np.ones(9), 1.0, None)[0]
     true = lt.integrate(body, np.random.default_rng(0).standard_normal(3), (0.0, 8.0), 0.05, save_every=4)
     np.testing.assert_allclose(states[:, 4:], R.reshape(-1, 9), atol=2e-3)  # splines are worst at their ends: 4e-4
     np.testing.assert_allclose(states[5:-5, :3], true.x[5:-5, :3], atol=2e-2)
@@ -300,7 +300,7 @@ def test_an_observation_that_cannot_be_used_has_an_error_of_one_line(how, words)
 def test_noise_with_a_unit_is_the_same_as_in_si_units():
     """The states of a table with units are in SI units, so ``"0.5 deg"`` is 0.0087 rad."""
     for noise, values in (("0.5 deg", np.pi / 360.0), (["0.5 deg", 0.01], [np.pi / 360.0, 0.01])):
-        np.testing.assert_allclose(checked_noise(noise, 2), np.broadcast_to(values, 2), rtol=1e-15)
+        np.testing.assert_allclose(checked_noise_std(noise, 2), np.broadcast_to(values, 2), rtol=1e-15)
     data = cases.oscillator(), cases.record(2, 21)
     how = {"matching": 0, "shooting": 20, "rate": 0.1, "window": 5}
     fits = [lt.learn.fit(*data, noise=noise, **how) for noise in ("0.6 deg", np.radians(0.6))]

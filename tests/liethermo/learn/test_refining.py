@@ -15,8 +15,8 @@ import scipy.optimize
 import liethermo as lt
 import manifolds as mf
 from liethermo.learn import files, training
-from liethermo.learn.data import Trajectory, estimate_noise
-from liethermo.learn.least_squares import MAX_STEP_BIAS, MIN_RELATIVE_BIAS, _is_negligible
+from liethermo.learn.data import Trajectory, estimate_noise_if_visible
+from liethermo.learn.least_squares import MAX_STEP_BIAS, MIN_RELATIVE_BIAS, _is_negligible_change
 from liethermo.learn.refining import LeastSquaresResult
 
 pytest.importorskip("optax")
@@ -170,13 +170,13 @@ def test_noise_is_told_from_motion():
     for noise in (0.005, 0.05):
         random = np.random.default_rng(1)
         data = [Trajectory(t, run(start, RATE, t) + noise * random.standard_normal((90, 3))) for start in STARTS]
-        np.testing.assert_allclose(estimate_noise(data, np.ones(3)), noise, rtol=0.25)
+        np.testing.assert_allclose(estimate_noise_if_visible(data, np.ones(3)), noise, rtol=0.25)
     for times in (t, np.linspace(0.0, 8.0, 17)):  # 17 rows are 9 in a period
         data = [Trajectory(times, run(start, RATE, times)) for start in STARTS]
-        assert estimate_noise(data, np.ones(3)) is None
-    assert estimate_noise([Trajectory(t[:3], np.zeros((3, 1)))], np.ones(1)) is None
+        assert estimate_noise_if_visible(data, np.ones(3)) is None
+    assert estimate_noise_if_visible([Trajectory(t[:3], np.zeros((3, 1)))], np.ones(1)) is None
     rounded_data = [Trajectory(TIMES, run(STARTS[0], RATE) + 1e-9 * np.random.default_rng(0).standard_normal((81, 3)))]
-    assert estimate_noise(rounded_data, np.ones(3)) is None
+    assert estimate_noise_if_visible(rounded_data, np.ones(3)) is None
 
 
 def test_data_without_noise_can_be_said_to_be_exact():
@@ -263,6 +263,6 @@ def test_steps_are_short_enough_where_shorter_ones_hardly_change_the_parameters(
         iterations=3,
         degrees_of_freedom=10,
         states=np.zeros((1, 2, 3)),
-        mean_squares=np.ones(1),
+        residual_variances=np.ones(1),
     )
-    assert _is_negligible(np.array([0.0, shift]), result, np.array([False, False])) == is_negligible
+    assert _is_negligible_change(np.array([0.0, shift]), result, np.array([False, False])) == is_negligible

@@ -83,7 +83,7 @@ def test_every_parameter_of_a_model_keeps_the_laws_and_has_an_effect(name):
 
     def functions_of(system) -> list[np.ndarray]:
         values = [system.vector_field(x), *(system.energy.value(y) for y in x)]
-        values += [] if system.baths is None else [system.temperatures(x)]
+        values += [system.temperatures(x)] if system.baths.number else []
         return [np.asarray(value) for value in values]
 
     for parameter, value in named_parameters(system).items():

@@ -17,7 +17,7 @@ import liethermo as lt
 import manifolds as mf
 from liethermo import disk
 from liethermo.studies import store_metadata
-from liethermo.studies.running import run_locally
+from liethermo.studies.running import solve_chunks_locally
 
 from .cases import RATES, RATIOS, X0, body, content, study
 
@@ -90,15 +90,17 @@ def test_chunks_and_their_order_make_no_difference_to_the_last_bit(finished_stud
 
     def run_in_reverse(solver, store, axes, survey, bar):
         survey.remaining_chunks.reverse()
-        run_locally(solver, store, axes, survey, bar)
+        solve_chunks_locally(solver, store, axes, survey, bar)
 
-    monkeypatch.setattr("liethermo.studies.study.run_locally", run_in_reverse)
+    monkeypatch.setattr("liethermo.studies.study.solve_chunks_locally", run_in_reverse)
     assert study(tmp_path / "backwards.zarr").run().complete
     assert content(tmp_path / "backwards.zarr") == content(finished_study[0])
 
 
 def test_nothing_is_done_twice(finished_study, monkeypatch):
-    monkeypatch.setattr("liethermo.studies.study.run_locally", lambda *_: pytest.fail("there is nothing to do"))
+    monkeypatch.setattr(
+        "liethermo.studies.study.solve_chunks_locally", lambda *_: pytest.fail("there is nothing to do")
+    )
     initial_content = content(finished_study[0])
     assert study(finished_study[0]).run().complete
     assert content(finished_study[0]) == initial_content
@@ -116,11 +118,11 @@ def test_longer_axes_run_the_new_points_alone(finished_study, tmp_path):
         solver.solve = lambda points, states, count, *rest: (
             solved_counts.append(count) or solve(points, states, count, *rest)
         )
-        run_locally(solver, store, axes, survey, bar)
+        solve_chunks_locally(solver, store, axes, survey, bar)
         del solver.solve
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("liethermo.studies.study.run_locally", run_and_count)
+        patch.setattr("liethermo.studies.study.solve_chunks_locally", run_and_count)
         assert study(store).run().complete
     assert sum(solved_counts) == 35 - 12
     extended_results, reference_results = study(store).results.load(), study(finished_study[0]).results.load()
@@ -365,11 +367,11 @@ def test_ctrl_c_leaves_a_store_to_go_on_from(finished_study, tmp_path, monkeypat
 
     def run_and_interrupt(solver, store, axes, survey, bar):
         del survey.remaining_chunks[3:]
-        run_locally(solver, store, axes, survey, bar)
+        solve_chunks_locally(solver, store, axes, survey, bar)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("liethermo.studies.study.run_locally", run_and_interrupt)
+        patch.setattr("liethermo.studies.study.solve_chunks_locally", run_and_interrupt)
         status = study(store).run()
     assert status.interrupted
     assert (status.done, status.points) == (15, 35)

@@ -6,6 +6,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import liethermo as lt
+import manifolds as mf
 from tests.refusals import refusal_test
 
 FIELD = 1.2
@@ -91,6 +92,59 @@ def test_the_pulse_has_its_energy_and_its_width():
     t = np.linspace(0.0, 1.0, 2001)
     assert abs(np.trapezoid(np.asarray(pulse(t)), t) - 2.0) < 1e-12
     assert abs(float(pulse(0.55)) - 0.5 * float(pulse(0.5))) < 1e-12
+
+
+METHODS_ON_A_SPHERE = [
+    (lt.MetriplecticMidpoint(), 1e-4),
+    (lt.MetriplecticGauss(2), 5e-9),
+    (lt.MetriplecticRungeKutta(4), 5e-8),
+]
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize(("method", "tolerance"), METHODS_ON_A_SPHERE, ids=str)
+def test_friction_on_a_sphere_heats_a_bath(method, tolerance):
+    """Beside SciPy: the point slides downhill on the sphere, and the bath takes the energy."""
+    A, rate, capacity, temperature = np.diag([1.0, 2.0, 4.0]), 0.3, 2.0, 1.5
+    x0 = np.array([0.6, 0.48, 0.64])
+
+    def rates(t, u):
+        slope = A @ u[:3] - u[:3] * (u[:3] @ A @ u[:3])
+        return [*(-rate * slope), rate * slope @ slope / (temperature * np.exp(u[3] / capacity))]
+
+    reference = solve_ivp(rates, (0.0, 2.0), [*x0, 0.0], method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    system = lt.MetriplecticSystem(
+        mf.NoPoisson(3),
+        lambda x: 0.5 * x @ jnp.asarray(A) @ x,
+        dissipation=lt.Friction(rate * np.eye(3)),
+        space=mf.Sphere(2),
+        baths=lt.HeatBaths(capacity, temperature),
+    )
+    run = lt.integrate(system, x0, (0.0, 2.0), 0.05, method)
+    assert np.abs(run.x[-1] - reference).max() < tolerance
+    assert run.audit().passed
+    assert run.audit().energy_drift < 1e-15
+    assert system.check().passed
+
+
+SPACES = {
+    "sphere": mf.Sphere(2),
+    "SPD(2)": mf.SPD(2),
+    "SO(3)": mf.GroupSpace(mf.SO(3)),
+    "product": mf.Product(mf.Sphere(2), mf.Euclidean(1)),
+}
+
+
+@pytest.mark.parametrize("space", SPACES.values(), ids=SPACES)
+def test_random_states_of_spaces_with_baths(space):
+    """The entropies of baths are normal numbers with their capacities as standard deviations."""
+    size = space.size
+    friction, baths = lt.Friction(np.eye(size)), lt.HeatBaths([1e3, 1e-3])
+    system = lt.MetriplecticSystem(
+        mf.NoPoisson(size), lambda x: jnp.sum(x**2), dissipation=friction, space=space, baths=baths, validate=False
+    )
+    entropies = system.samples(50)[:, size:]
+    assert np.abs(np.log10(np.std(entropies, axis=0)) - [3.0, -3.0]).max() < 0.2
 
 
 @pytest.mark.slow

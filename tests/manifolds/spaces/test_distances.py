@@ -164,6 +164,25 @@ def test_hyperbolic_points_ten_apart_far_out():
         assert abs(float(space.distance(hyperbolic_point(r, 0.0), hyperbolic_point(r + 10.0, 0.0))) - 10.0) < 1e-13
 
 
+@pytest.mark.parametrize("n", [2, 3, 6])
+def test_hyperbolic_points_on_one_ray_at_any_radius(n):
+    """Rounding of the coordinates turns the directions by 1e-16, which is 325 units of length at radius 200."""
+    space, rng = mf.Hyperbolic(n), np.random.default_rng(n)
+    directions = [np.eye(n)[0], np.eye(n)[-1], *rng.standard_normal((4, n))]
+    cases = [
+        (u, r, d) for u in directions for r in (35.0, 36.0, 50.0, 100.0, 200.0, 340.0) for d in (0.1, 1.0, 7.0, 12.0)
+    ]
+    units, r, d = (np.array(a) for a in zip(*cases, strict=True))
+    units = units / np.linalg.norm(units, axis=1, keepdims=True)
+    x, y = (np.column_stack([np.cosh(a), np.sinh(a)[:, None] * units]) for a in (r, r + d))
+    for distances in (space.distance(x, y), space.distance(y, x)):
+        assert (np.abs(distances - d) < 1e-15 * (r + d)).all()
+    opposite = y * np.array([1.0, *-np.ones(n)])
+    assert np.asarray(space.distance(x, opposite)) == pytest.approx(2 * r + d, rel=1e-14)
+    x, y = (np.array([np.cosh(r), *(np.sinh(r) * u)]) for r, u in ((200.0, np.eye(n)[0]), (203.0, np.eye(n)[1])))
+    assert float(space.distance(x, y)) == pytest.approx(403.0 - np.log(2.0), rel=1e-14)  # a right angle between them
+
+
 def test_hyperbolic_derivatives_far_out():
     """The branches of the formula for far points are smooth at equal radii too: the Hessian is twice the metric."""
     space = mf.Hyperbolic(2)
@@ -194,17 +213,37 @@ def subspaces(n, p, angles, seed):
 def test_grassmann_near_a_right_angle(n, p):
     space = mf.Grassmann(n, p)
     other_angles = [0.3, 1.1][: p - 1]
-    for gap in (1.0, 1e-2, 1e-5, 3e-8, 1e-10, 0.0):
+    for gap in (1.0, 1e-2, 1e-5, 3e-8, 1e-8, 1e-10, 1e-12, 0.0):
         x, y = subspaces(n, p, [np.pi / 2 - gap, *other_angles], seed=int(1e3 * gap))
         length = np.sqrt(2.0 * ((np.pi / 2 - gap) ** 2 + np.sum(np.square(other_angles))))
         assert abs(float(space.distance(x, y)) - length) < tolerance("angle")
-        if gap < 1e-8:
-            with pytest.raises(mf.DomainError, match="right angle"):
-                space.log(x, y)
+        if gap == 0.0:
+            for function in (space.log, space.midpoint):
+                with pytest.raises(mf.DomainError, match="right angle"):
+                    function(x, y)
             continue
+        z = space.midpoint(x, y)
+        assert abs(float(space.distance(x, z)) - length / 2) < tolerance("angle")
+        assert abs(float(space.distance(y, z)) - length / 2) < tolerance("angle")
         v = space.log(x, y)
         assert abs(float(space.norm(x, v)) - length) < tolerance("angle")
         assert max_abs(np.asarray(space.exp(x, v)) - y) < tolerance("way")
+
+
+@pytest.mark.parametrize("n", [1, 2, 7])
+def test_sphere_near_the_antipode(n):
+    space = mf.Sphere(n)
+    q = np.linalg.qr(np.random.default_rng(n).standard_normal((n + 1, n + 1)))[0]
+    for gap in (1e-2, 1e-6, 3e-8, 1e-8, 1e-10, 1e-12, 1e-13):
+        x, y = q[0], np.sin(gap) * q[1] - np.cos(gap) * q[0]
+        z, v = space.midpoint(x, y), space.log(x, y)
+        assert abs(float(space.norm(x, v)) - (np.pi - gap)) < tolerance("angle")
+        assert max_abs(np.asarray(space.exp(x, v)) - y) < tolerance("way")
+        for end in (x, y):
+            assert abs(float(space.distance(end, z)) - (np.pi - gap) / 2) < tolerance("angle")
+    for function in (space.log, space.midpoint):
+        with pytest.raises(mf.DomainError, match="of the antipode of x"):
+            function(q[0], -q[0])
 
 
 def test_grassmann_neighbours_keep_their_relative_accuracy():
