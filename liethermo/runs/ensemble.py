@@ -249,16 +249,14 @@ class _EnsembleOptions(NamedTuple):
         """Run a group of trajectories; ``report`` is called with the number of finished ones."""
 
         def run_with_engine(engine: str) -> None:
-            progress_counter, record.engine = ProgressCounter(report), engine
-            run = (
-                FixedEnsembleRun(record, progress_counter)
-                if record.control is None
-                else AdaptiveEnsembleRun(record, record.control, progress_counter)
-            )
+            record.engine = engine
+            run_class = FixedEnsembleRun if group.control is None else AdaptiveEnsembleRun
+            run = run_class(record, ProgressCounter(report))
             (run.run_compiled if engine == "compiled" else run.run_array)()
 
-        calls_python = record.events is not None and record.events.calls_python
-        is_worthwhile = not calls_python and is_worth_compiling(record.member, record.method)
+        group = record.group
+        calls_python = group.events is not None and group.events.calls_python
+        is_worthwhile = not calls_python and is_worth_compiling(group.member, group.method)
         prefers_compiled = self.engine == "auto" and is_worthwhile
         if self.engine == "compiled" or prefers_compiled:
             try:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -32,7 +32,7 @@ from ..results.step_sampling import (
     vector_field,
 )
 from ..systems import System
-from ..systems.conditions import RunCondition, worst_conditions
+from ..systems.conditions import worst_conditions
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.scalarize import UnsupportedPrimitive
 from .lanes import replay_steps
@@ -49,7 +49,7 @@ MAX_LOCAL_ERROR_VALUES = 2_000
 """Largest number of components in the states of all repeated steps; but at least four steps are repeated."""
 
 CONSISTENCY_STATES = 3
-"""Number of states at which short steps are compared with the vector field."""
+"""Number of states at which short steps are compared with the vector field, besides one of each other trajectory."""
 
 STEP_REFINEMENTS = 7
 """Number of short steps from each of these states, each an eighth of the one before."""
@@ -84,11 +84,14 @@ MAX_REPLAYED_STEPS = 256
 """Largest number of steps of a trajectory that an audit replays on the array engine, whose steps are slow."""
 
 
-class StepReplay(Protocol):
-    """Function that repeats steps of trajectories."""
+@dataclass(frozen=True, eq=False)
+class EngineReplay:
+    """Replays steps of one trajectory with the engine of its run."""
 
-    def __call__(
-        self, trajectory: np.ndarray, x: np.ndarray, h: np.ndarray, steps: int = 1
+    engine: EngineWithFallback
+
+    def displacements(
+        self, trajectory: np.ndarray, x: np.ndarray, h: np.ndarray, steps: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Take ``steps`` steps of size h[i] from each state x[i] of the trajectory with the index ``trajectory[i]``.
 
@@ -99,18 +102,6 @@ class StepReplay(Protocol):
         array of bool, shape (m,)
             Whether each is known; False if a step failed.
         """
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class EngineReplay:
-    """Replays steps of one trajectory with the engine of its run: a :class:`StepReplay`."""
-
-    engine: EngineWithFallback
-
-    def __call__(
-        self, trajectory: np.ndarray, x: np.ndarray, h: np.ndarray, steps: int = 1
-    ) -> tuple[np.ndarray, np.ndarray]:
         displacements, is_known = np.zeros_like(x), np.zeros(len(x), dtype=bool)
         for i in range(len(x)):
             try:
@@ -134,7 +125,7 @@ class EngineReplay:
 
 @dataclass(frozen=True, eq=False)
 class LaneReplay:
-    """Replays steps of the trajectories of an ensemble, all at once: a :class:`StepReplay`.
+    """Replays steps of the trajectories of an ensemble, all at once.
 
     Attributes
     ----------
@@ -148,14 +139,21 @@ class LaneReplay:
     family: Family
     method: OneStepMethod
 
-    def __call__(
-        self, trajectory: np.ndarray, x: np.ndarray, h: np.ndarray, steps: int = 1
+    def displacements(
+        self, trajectory: np.ndarray, x: np.ndarray, h: np.ndarray, steps: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        try:
-            after, _ = replay_steps(self.engine, self.family.select(trajectory), self.method, x, h, steps)
-        except UnsupportedPrimitive:  # Newton's method, which the run did not need
-            return np.zeros_like(x), np.zeros(len(x), dtype=bool)
-        return (after["x"] - x) + after["compensation"], after["status"] == StatusCode.COMPLETED
+        """Return the displacements after ``steps`` steps, and whether each is known: see :class:`EngineReplay`."""
+        displacements, is_known = np.zeros_like(x), np.zeros(len(x), dtype=bool)
+        for start in range(0, len(x), MAX_LOCAL_ERROR_STEPS):  # few numbers of lanes, few programs
+            rows = slice(start, start + MAX_LOCAL_ERROR_STEPS)
+            members = self.family.select(trajectory[rows])
+            try:
+                after, _ = replay_steps(self.engine, members, self.method, x[rows], h[rows], steps)
+            except UnsupportedPrimitive:  # Newton's method, which the run did not need
+                continue
+            is_known[rows] = after["status"] == StatusCode.COMPLETED
+            displacements[rows] = (after["x"] - x[rows]) + after["compensation"]
+        return displacements, is_known
 
     def steps_from_start(self, x: np.ndarray, h: np.ndarray, t: float, n_steps: np.ndarray) -> StepSample:
         """Return the first n_steps[i] steps of each trajectory i from x[i] at time t; fewer if one fails."""
@@ -200,19 +198,24 @@ class StepChecker:
         The system of one of the trajectories, whose states are like those of all.
     evaluate : function of (function, trajectory, x)
         Returns ``function(system, x)`` for states, shape (m, n), each in the system of its trajectory.
-    replay : StepReplay
+    replay : EngineReplay or LaneReplay
     min_motion : array, shape (trajectories,)
         Smallest length relative to which the error of a step of each trajectory is taken.
     """
 
-    def __init__(self, system: System, evaluate: Callable, replay: StepReplay, min_motion: np.ndarray):
+    def __init__(self, system: System, evaluate: Callable, replay: EngineReplay | LaneReplay, min_motion: np.ndarray):
         self.system, self.evaluate, self.replay, self.min_motion = system, evaluate, replay, min_motion
         self.n_substeps = n_replayed_steps(system.dim)
 
     def complete(self, evidence: Evidence, sample: StepSample) -> Evidence:
-        """Return the evidence with local error and inconsistency, as far as the steps of the sample show them."""
+        """Return the evidence with local error and inconsistency, as far as the steps of the sample show them.
+
+        Each trajectory of the sample has a step that is compared with its vector field.
+        """
         indices, defects = self._select_worst_steps(sample)
-        steps = sample.select(indices)
+        trajectories, first_steps = np.unique(sample.trajectory, return_index=True)
+        others = first_steps[~np.isin(trajectories, sample.trajectory[indices])]
+        steps = sample.select(np.append(indices, others))
         replayed = self._replay(steps, self._field_change_by_rounding(steps))
         for field_rounding in (None, self._field_rounding):
             if field_rounding is not None:
@@ -225,7 +228,7 @@ class StepChecker:
             if len(self.system.state_blocks) == 1 or inconsistency is None or inconsistency <= CONSISTENCY_SKIP_LEVEL:
                 break
         evidence = dataclasses.replace(evidence, inconsistency=inconsistency)
-        errors = self._local_errors(replayed, defects)
+        errors = self._local_errors(replayed.select(np.arange(len(indices))), defects)
         if errors is None:
             return evidence
         worst = int(np.argmax(errors))
@@ -269,7 +272,9 @@ class StepChecker:
         """
         h = replayed.steps.h
         moving = np.flatnonzero(relative_length > 1e-6 * (relative_length / h).max() * h)
-        moving = moving[evenly_spaced_indices(len(moving), CONSISTENCY_STATES)]
+        _, first_steps_of_trajectories = np.unique(replayed.steps.trajectory[moving], return_index=True)
+        evenly_spaced = evenly_spaced_indices(len(moving), CONSISTENCY_STATES)
+        moving = moving[np.union1d(evenly_spaced, first_steps_of_trajectories)]
         h, relative_length, min_field = h[moving], relative_length[moving], replayed.min_field[moving]
         steps = replayed.steps.select(moving)._replace(h=np.minimum(h, SHORT_STEP_FRACTION * h / relative_length))
         defects, first_steps = self._short_step_defects(steps, min_field)
@@ -320,7 +325,7 @@ class StepChecker:
 
     def _replay(self, steps: StepSample, min_field: np.ndarray, n_substeps: int = 1) -> ReplayedSteps:
         """Repeat steps, each in one piece or in as many substeps."""
-        displacement, is_known = self.replay(steps.trajectory, steps.x, steps.h / n_substeps, n_substeps)
+        displacement, is_known = self.replay.displacements(steps.trajectory, steps.x, steps.h / n_substeps, n_substeps)
         return ReplayedSteps(steps._replace(x_end=steps.x + displacement), displacement, is_known, min_field)
 
     def _field_change_by_rounding(self, steps: StepSample) -> np.ndarray:
@@ -395,18 +400,14 @@ class RunEvidence:
 
     @functools.cached_property
     def _evidence(self) -> Evidence:
-        functions = [*energy_and_entropy(self.system), *self.functions.values()]
-        names = [*("energy", "entropy")[: len(functions) - len(self.functions)], *self.functions]
+        functions = {**energy_and_entropy(self.system), **self.functions}
         sample_indices = evenly_spaced_indices(len(self.x), MAX_SENSITIVITY_STATES)
-        sampled_x = self.x[sample_indices]
-        sensitivities, terms = evaluate_at_points(rounding_scales, tuple(functions), sampled_x)
-        sensitivity_by_name = dict(zip(names, column_maxima(sensitivities), strict=True))
-        energy, entropy = sensitivity_by_name.pop("energy"), sensitivity_by_name.pop("entropy", None)
-        conditions = self.system.run_conditions(
-            sampled_x, np.asarray(self.t)[sample_indices], frozenset(self.method.preserves)
-        )
-        term_scales = dict(zip(names, column_maxima(terms), strict=True))
-        evidence = Evidence(energy, entropy, sensitivity_by_name, term_scales, conditions=conditions)
+        sampled_x, guarantees = self.x[sample_indices], frozenset(self.method.preserves)
+        scales = evaluate_at_points(rounding_scales, tuple(functions.values()), sampled_x)
+        sensitivities, terms = (dict(zip(functions, column_maxima(columns), strict=True)) for columns in scales)
+        energy, entropy = sensitivities.pop("energy"), sensitivities.pop("entropy", None)
+        conditions = self.system.run_conditions(sampled_x, np.asarray(self.t)[sample_indices], guarantees)
+        evidence = Evidence(energy, entropy, sensitivities, terms, conditions=conditions)
         if not has_smooth_steps(self.method) or not len(h := self.step_sizes()):
             return evidence
         user_states = np.asarray(self.system.points(sampled_x)).reshape(len(sampled_x), -1).view(np.float64)
@@ -456,7 +457,16 @@ class GroupEvidence:
 
     @np.errstate(over="ignore", invalid="ignore")  # overflowed states have the status non_finite
     def __call__(self) -> Evidence:
-        evidence = Evidence(terms=self._rounding_scales(), conditions=self._conditions(), drifts=self._drifts())
+        family, guarantees = self.replay.family, frozenset(self.replay.method.preserves)
+        scales = family.evaluate(energy_and_entropy_rounding_scales, slice(None), self.x).max(axis=0)
+        terms = dict(zip(energy_and_entropy(self.member), map(float, np.nan_to_num(scales)), strict=True))
+        known_states = [states[np.isfinite(states).all(axis=1)] for states in self.saved_states]
+        conditions = worst_conditions(
+            family.member(i).run_conditions(states, self.saved_times, guarantees)
+            for i, states in enumerate(known_states)
+        )
+        drifts = largest_drifts(self._member_drifts(i, states) for i, states in enumerate(known_states))
+        evidence = Evidence(terms=terms, conditions=conditions, drifts=drifts)
         n_steps = np.fmin(self.n_equal_steps, max(1, MAX_SAMPLED_VALUES // (REPLAY_COST_RATIO * self.x.size)))
         if self.replay.engine != "compiled":
             n_steps = np.fmin(n_steps, MAX_REPLAYED_STEPS)
@@ -465,22 +475,11 @@ class GroupEvidence:
         sample = self.replay.steps_from_start(self.x, self.h, self.start_time, n_steps)
         if not len(sample.h):
             return evidence
-        evaluate, min_motion = self.replay.family.evaluate, MIN_MOTION_FRACTION * self.distance
-        return StepChecker(self.member, evaluate, self.replay, min_motion).complete(evidence, sample)
-
-    def _conditions(self) -> tuple[RunCondition, ...]:
-        """Return the conditions beside the laws, each of the trajectory where it is worst."""
-        guarantees, member = frozenset(self.replay.method.preserves), self.replay.family.member
-        return worst_conditions(
-            member(i).run_conditions(states, self.saved_times, guarantees)
-            for i, states in enumerate(self._known_states())
-        )
-
-    def _drifts(self) -> dict[str, InvariantDrift]:
-        """Return the drifts of what the method promises to keep, each of the trajectory where it is worst."""
-        return largest_drifts(self._member_drifts(i, states) for i, states in enumerate(self._known_states()))
+        checker = StepChecker(self.member, family.evaluate, self.replay, MIN_MOTION_FRACTION * self.distance)
+        return checker.complete(evidence, sample)
 
     def _member_drifts(self, i: int, states: np.ndarray) -> dict[str, InvariantDrift]:
+        """Return the drifts along trajectory i of what the method promises to keep."""
         recorded, laws = invariants_and_laws(self.replay.family.member(i), self.replay.method)
         functions = {name: function for name, (function, _) in recorded.items() if name in laws.conserved}
         if not functions or not len(states):
@@ -488,15 +487,6 @@ class GroupEvidence:
         scales = map(column_maxima, evaluate_at_points(rounding_scales, tuple(functions.values()), states))
         columns = zip(series_of_functions(functions, states).items(), *scales, strict=True)
         return {name: InvariantDrift.from_series(values, *maxima) for (name, values), *maxima in columns}
-
-    def _known_states(self) -> Iterator[np.ndarray]:
-        """Return the saved states of each trajectory up to its end; nothing if none were kept."""
-        return (states[np.isfinite(states).all(axis=1)] for states in self.saved_states)
-
-    def _rounding_scales(self) -> dict[str, float]:
-        """Return the sizes that set the rounding errors of energy and entropy, each the largest over the starts."""
-        scales = self.replay.family.evaluate(energy_and_entropy_rounding_scales, slice(None), self.x).max(axis=0)
-        return {name: float(scale) for name, scale in zip(("energy", "entropy"), np.nan_to_num(scales), strict=False)}
 
 
 def has_smooth_steps(method: Any) -> bool:
@@ -531,9 +521,9 @@ def _field_rounding_scale(system: System, x) -> jnp.ndarray:
     return value_and_rounding_scale(system.vector_field, x)[1]
 
 
-def energy_and_entropy(system: System) -> list[Energy]:
-    """Return a list of the energy and, if there is one, the entropy."""
-    return [system.energy, *([] if system.entropy is None else [system.entropy])]
+def energy_and_entropy(system: System) -> dict[str, Energy]:
+    """Return the energy and, if there is one, the entropy, by these names."""
+    return {"energy": system.energy, **({} if system.entropy is None else {"entropy": system.entropy})}
 
 
 def rounding_scales(functions: Sequence[Energy], x) -> tuple[jnp.ndarray, jnp.ndarray]:
@@ -544,7 +534,7 @@ def rounding_scales(functions: Sequence[Energy], x) -> tuple[jnp.ndarray, jnp.nd
 
 def energy_and_entropy_rounding_scales(system: System, x) -> jnp.ndarray:
     """Return the rounding scales of the values of energy and entropy at x, shape (1,) without an entropy or (2,)."""
-    return rounding_scales(energy_and_entropy(system), x)[1]
+    return rounding_scales(tuple(energy_and_entropy(system).values()), x)[1]
 
 
 def series_of_functions(functions: Mapping[str, Energy], x: np.ndarray) -> dict[str, np.ndarray]:

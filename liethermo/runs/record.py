@@ -14,6 +14,7 @@ from ..engines.select_engine import EngineWithFallback
 from ..engines.status_codes import StatusCode
 from ..engines.step import energy_or_entropy_that_relaxes
 from ..engines.step_control import StepControl
+from ..integrators import OneStepMethod
 from ..results.audit_evidence import merge_evidence
 from ..results.ensemble import Ensemble
 from ..results.events import Events
@@ -28,7 +29,6 @@ from .events import EventSet, collect_events
 from .evidence import (
     MAX_LOCAL_ERROR_STEPS,
     MAX_SENSITIVITY_STATES,
-    EngineReplay,
     GroupEvidence,
     LaneReplay,
     evenly_spaced_indices,
@@ -94,6 +94,11 @@ class TrajectoryGroup(NamedTuple):
     control: StepControl | None
     events: EventSet | None
     noise: NoisePaths | None
+
+    @property
+    def method(self) -> OneStepMethod:
+        """The method of all trajectories."""
+        return self.problem.method
 
 
 class EnsembleRecord:
@@ -167,8 +172,8 @@ class EnsembleRecord:
             if self.trajectories is not None:
                 work = np.asarray(self.driven.work(x))
             x, x0, energy = None if x is None else x[..., :-2], x0[..., :-2], energy + work
-        sources = [group.evidence_source() for group in self.groups]
-        engine, events = " and ".join(sorted({group.engine for group in self.groups} - {""})), self.groups[0].events
+        events, sources = self.groups[0].group.events, [part.evidence_source() for part in self.groups]
+        engine = " and ".join(sorted({part.engine for part in self.groups} - {""}))
         result = Ensemble(
             t=t,
             x=x,
@@ -182,7 +187,7 @@ class EnsembleRecord:
             attitude=attitude,
             attitude0=attitude0,
             work=work,
-            laws=common_laws([group.problem.laws for group in self.groups]),
+            laws=common_laws([part.group.problem.laws for part in self.groups]),
             engine=engine,
             events=Events() if events is None else collect_events(self.member, events.names, self.events),
             reasons={**reasons, **self.failure_reasons},
@@ -202,16 +207,15 @@ class EnsembleRecord:
         return {name: functools.partial(self._velocities, name) for name in self.member.motion_quantities.velocities}
 
     def _velocities(self, name: str) -> np.ndarray:
-        parts = [group.velocities(name) for group in self.groups]
-        values = np.full((len(self.status), *parts[0].shape[1:]), np.nan)
-        for group, part in zip(self.groups, parts, strict=True):
-            values[group.numbers] = part
+        velocities, numbers = zip(*((part.velocities(name), part.numbers) for part in self.groups), strict=True)
+        values = np.full((len(self.status), *velocities[0].shape[1:]), np.nan)
+        values[np.concatenate(numbers)] = np.concatenate(velocities)
         return values
 
     def _build_solution(self, ensemble: Ensemble, i: int) -> Solution:
         """Return the solution of a trajectory, as a single run would present it."""
-        group = next(group for group in self.groups if i in group.numbers)
-        return group.build_solution(ensemble.member_solution(i), int(np.searchsorted(group.numbers, i)))
+        part = next(part for part in self.groups if i in part.numbers)
+        return part.build_solution(ensemble.member_solution(i), int(np.searchsorted(part.numbers, i)))
 
 
 class GroupRecord:
@@ -231,15 +235,12 @@ class GroupRecord:
     """
 
     def __init__(self, record: EnsembleRecord, group: TrajectoryGroup):
-        self.numbers, self.problem, self.family, self.member, self.x0, self.schedule, self.h = group[:7]
-        self.method = self.problem.method
-        self.control, self.events, self.noise = group[7:]
-        self.record, self.engine = record, ""
+        self.record, self.group, self.numbers, self.engine = record, group, group.numbers, ""
         self._is_all = len(self.numbers) == len(record.status)
         rows = self._rows(slice(None))
         record.status[rows] = StatusCode.INTERRUPTED
-        record.quantities["first_step"][rows] = self.schedule.longest_steps[0]
-        record.quantities["end_time"][rows] = self.schedule.start
+        record.quantities["first_step"][rows] = group.schedule.longest_steps[0]
+        record.quantities["end_time"][rows] = group.schedule.start
 
     def _rows(self, members: MemberSelection) -> MemberSelection:
         """Return the rows of the record for the trajectories with these indices in the group."""
@@ -291,12 +292,12 @@ class GroupRecord:
         initial, final : mapping of arrays
             Fields of :class:`liethermo.engines.step.State`.
         """
-        steps = final["step"].astype(np.int64)
-        is_unfinished = (final["status"] == StatusCode.COMPLETED) & (steps < self.schedule.n_steps)
+        steps, schedule = final["step"].astype(np.int64), self.group.schedule
+        is_unfinished = (final["status"] == StatusCode.COMPLETED) & (steps < schedule.n_steps)
         status = np.where(is_unfinished, StatusCode.INTERRUPTED, final["status"])
-        self.finish_members(members, initial, final, status, self.schedule.times_after(steps))
+        self.finish_members(members, initial, final, status, schedule.times_after(steps))
         if self.record.trajectories is not None:
-            counts, rows = self.schedule.saved_step_counts, self._rows(members)
+            counts, rows = schedule.saved_step_counts, self._rows(members)
             is_after_end = np.arange(len(counts)) >= np.searchsorted(counts, steps, side="right")[:, None]
             trajectories = self.record.trajectories
             trajectories[rows] = np.where(is_after_end[..., None], np.nan, trajectories[rows])
@@ -312,7 +313,7 @@ class GroupRecord:
         n_rejected: np.ndarray | None = None,
     ) -> None:
         """Record the outcome of trajectories: status, end time, final state and the quantities of the audit."""
-        record, rows = self.record, self._rows(members)
+        record, group, rows = self.record, self.group, self._rows(members)
         quantities, energy, initial_energy = record.quantities, final["energy"], initial["energy"]
         quantities["energy"][rows], quantities["entropy"][rows] = energy, final["entropy"]
         drift = np.maximum(final["largest_energy"] - initial_energy, initial_energy - final["smallest_energy"])
@@ -327,11 +328,12 @@ class GroupRecord:
         quantities["residual"][rows] = final["residual"]
         quantities["end_time"][rows] = end_time
         start, end = (
-            np.asarray(energy_or_entropy_that_relaxes(self.member, f["energy"], f["entropy"])) for f in (initial, final)
+            np.asarray(energy_or_entropy_that_relaxes(group.member, f["energy"], f["entropy"]))
+            for f in (initial, final)
         )
         change = np.where(np.abs(end - start) > 1e-12 * np.abs(end), end - start, np.nan)
         quantities["relaxation_time"][rows] = (
-            end * (end_time - self.schedule.start) - final["relaxation_integral"]
+            end * (end_time - group.schedule.start) - final["relaxation_integral"]
         ) / change
         record.status[rows], record.steps[rows] = status, final["step"]
         record.iterations[rows] = final["fixed_point_iterations"] + final["newton_iterations"]
@@ -353,12 +355,13 @@ class GroupRecord:
         ]
         if not len(failed_rows):
             return
-        member_indices = np.arange(len(self.x0))[members][failed_rows]
+        group = self.group
+        member_indices = np.arange(len(group.x0))[members][failed_rows]
         with np.errstate(all="ignore"):
-            velocities = np.asarray(self.family.evaluate(vector_field, member_indices, x[failed_rows]))
+            velocities = np.asarray(group.family.evaluate(vector_field, member_indices, x[failed_rows]))
         for i, j, velocity in zip(failed_rows, member_indices, velocities, strict=True):
             t = float(end_time[i])
-            if text := ensemble_failure_message(x[i], self.x0[j], velocity, t - self.schedule.start, t, self.h):
+            if text := ensemble_failure_message(x[i], group.x0[j], velocity, t - group.schedule.start, t, group.h):
                 self.record.failure_reasons[int(self.numbers[j])] = text
 
     def evidence_source(self) -> GroupEvidence:
@@ -366,15 +369,15 @@ class GroupRecord:
 
         Half of them are those that took most iterations, half are evenly spaced.
         """
-        n_steps = self.record.steps[self.numbers]
-        effort = self.record.iterations[self.numbers] / np.fmax(n_steps, 1)
-        sample = largest_and_evenly_spaced(effort, MAX_LOCAL_ERROR_STEPS)
-        n_equal_steps = 1 if np.isnan(self.h) else self.schedule.segments[0].n_full_steps
+        record, group = self.record, self.group
+        n_steps = record.steps[self.numbers]
+        sample = largest_and_evenly_spaced(record.iterations[self.numbers] / np.fmax(n_steps, 1), MAX_LOCAL_ERROR_STEPS)
+        n_equal_steps = 1 if np.isnan(group.h) else group.schedule.segments[0].n_full_steps
         return GroupEvidence(
-            self.member,
-            LaneReplay(self.engine, self.family.select(sample), self.method),
-            np.ascontiguousarray(self.x0[sample]),
-            self.schedule.start,
+            group.member,
+            LaneReplay(self.engine, group.family.select(sample), group.method),
+            np.ascontiguousarray(group.x0[sample]),
+            group.schedule.start,
             self.quantity("first_step", sample),
             np.fmin(n_steps[sample], max(1, n_equal_steps)),
             self.quantity("distance", sample),
@@ -404,26 +407,27 @@ class GroupRecord:
             states = x[rows]
         else:
             states = trajectories[rows, ..., :-2]
-        if not any(self.family.has_member_axis):
-            return velocities_at_states(name, self.member, states)
-        return np.stack([velocities_at_states(name, self.family.member(i), x) for i, x in enumerate(states)])
+        family = self.group.family
+        if not any(family.has_member_axis):
+            return velocities_at_states(name, self.group.member, states)
+        return np.stack([velocities_at_states(name, family.member(i), x) for i, x in enumerate(states)])
 
     def build_solution(self, member_solution: Solution, j: int) -> Solution:
         """Return the solution of trajectory j of the group, as a single run would present it.
 
         ``member_solution`` is the one that the ensemble has, without conserved functions.
         """
-        system, row, record = self.family.member(j), int(self.numbers[j]), self.record
+        method, system, row, record = self.group.method, self.group.family.member(j), int(self.numbers[j]), self.record
         if record.trajectories is None:
             assert record.x is not None
-            x = np.stack([self.x0[j], record.x[row]])
+            x = np.stack([self.group.x0[j], record.x[row]])
         else:
             x = record.trajectories[row, : len(member_solution.t), :-2]
         steps = np.minimum(np.diff(member_solution.t), record.quantities["first_step"][row])
-        invariants, laws = invariants_and_laws(system, self.method)
+        invariants, laws = invariants_and_laws(system, method)
         solution = build_solution(
             system,
-            self.method,
+            method,
             x,
             laws=laws,
             functions=RecordedFunctions.from_system(system, invariants),
@@ -431,7 +435,7 @@ class GroupRecord:
             energy=member_solution.energy_balance,
             entropy=member_solution.entropy,
             step_sizes=lambda: steps,
-            replay=EngineReplay(EngineWithFallback(system, self.method, "auto", 1)),
+            engine=EngineWithFallback(system, method, "auto", 1),
             status=member_solution.status,
             stats=member_solution.stats,
             provenance=member_solution.provenance,

@@ -31,7 +31,6 @@ from .adaptive import Adaptive, make_step_control
 from .adaptive_run import MAX_STORED_VALUES, AcceptedSteps, AdaptiveRun
 from .driver import drive_fixed
 from .events import EventSet, collect_events
-from .evidence import EngineReplay
 from .noise import NoisePaths
 from .problem import Problem
 from .schedule import EngineCall, StepSchedule
@@ -276,7 +275,7 @@ class Run:
             energy=energy,
             entropy=entropy,
             step_sizes=functools.partial(_longest_steps, self.schedule, self.taken_steps, len(x) - 1),
-            replay=EngineReplay(self.engine),
+            engine=self.engine,
             laws=self.problem.laws,
             functions=self.problem.functions,
             status=self.status or Status(StatusCode.INTERRUPTED, "still running", len(x) - 1, self.last_saved_time),

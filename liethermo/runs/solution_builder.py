@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from ..dissipation.base import dissipation_name
+from ..engines.select_engine import EngineWithFallback
 from ..functions.energy import Energy
 from ..results.solution import Solution, defer
 from ..results.status import Laws
@@ -59,7 +60,7 @@ def build_solution(
     x: np.ndarray,
     entropy: np.ndarray | None,
     step_sizes: Callable[[], np.ndarray],
-    replay: EngineReplay,
+    engine: EngineWithFallback,
     laws: Laws,
     functions: RecordedFunctions,
     **fields,
@@ -70,7 +71,8 @@ def build_solution(
     ----------
     step_sizes : function without arguments to an array, shape (times - 1,)
         Size of a step that the run took after each state.
-    replay : EngineReplay
+    engine : EngineWithFallback
+        The engine of the run.
     laws : Laws
     functions : RecordedFunctions
     **fields
@@ -82,7 +84,7 @@ def build_solution(
         casimirs=defer(functools.partial(series_of_functions, functions.of_series, x)),
         laws=laws,
         evidence_source=RunEvidence(
-            system, method, functions.invariants, x, np.asarray(fields["t"]), step_sizes, replay
+            system, method, functions.invariants, x, np.asarray(fields["t"]), step_sizes, EngineReplay(engine)
         ),
         velocity_sources={
             name: functools.partial(velocities_at_states, name, system, x) for name in functions.velocity_names
