@@ -224,13 +224,14 @@ MIN_STORED_COMPILE_SECONDS = 0.1
 def _compile(function: Callable, arguments: tuple, options: dict | None) -> Callable:
     """Return the program of a function of arrays, from the cache on disk or compiled by XLA.
 
-    The cache is found by the text of the program, so it never returns the program of another function. Programs that
-    call Python, or that run on accelerators or on several devices, are not cached, nor any if JAX's own cache is on:
+    The cache is found by the text of the program, so it never returns the program of another function. The text has
+    all arguments, also those that the program does not use: without them, programs that use different ones of their
+    arguments, or have unused arguments of different shapes, would have the same text. Programs that call Python, or that run on accelerators or on several devices, are not cached, nor any if JAX's own cache is on:
     a program that comes from there cannot be written again.
     """
     devices = jax.devices()
     is_cpu = devices[0].platform == "cpu"
-    jitted = jax.jit(function, compiler_options=options if is_cpu else None)
+    jitted = jax.jit(function, keep_unused=True, compiler_options=options if is_cpu else None)
     if len(devices) > 1 or not is_cpu or getattr(jax.config, "jax_compilation_cache_dir"):  # noqa: B009
         return jitted
     lowered = jitted.lower(arguments)

@@ -291,7 +291,8 @@ def test_every_spin_keeps_its_length_on_a_leaf_of_spins():
     spins = rest.x.reshape(-1, 2, 3)
     assert np.abs(np.linalg.norm(spins, axis=2) - [1.0, 1.5]).max() < 1e-9
     # a field above 2 K |s| leaves a spin its two poles, so the pair has four equilibria, of which one is stable
-    assert len(rest) == 4 and [bool(stable) for stable in rest.stable] == [True, False, False, False]
+    assert len(rest) == 4
+    assert [bool(stable) for stable in rest.stable] == [True, False, False, False]
     assert rest.level_names == ("|s|^2 / 2 at 1", "|s|^2 / 2 at 2")
 
 
@@ -299,7 +300,8 @@ def test_modes_of_spins_do_not_change_their_lengths():
     system = stoner_wohlfarth_spins([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]])
     modes = lt.linearise(system, [0.0, 0.0, 1.0, 0.0, 0.0, 1.0])
     # s' = s x B - 0.1 s x (s x B) near the pole, with B = field + 2 K
-    assert modes.eigenvalues.size == 4 and modes.stability == "asymptotically stable"
+    assert modes.eigenvalues.size == 4
+    assert modes.stability == "asymptotically stable"
     assert np.sort(modes.frequencies) == pytest.approx([1.6, 1.6, 2.6, 2.6], rel=1e-12)
     assert np.sort(modes.rates) == pytest.approx([0.16, 0.16, 0.26, 0.26], rel=1e-12)
 
@@ -308,6 +310,8 @@ def test_a_long_list_of_levels_is_shortened_where_it_is_printed():
     system = stoner_wohlfarth_spins(np.tile([0.0, 0.0, 1.0], (30, 1)))
     up = np.tile([0.0, 0.0, 1.0], (30, 1))
     rest = lt.equilibria(system, up, starts=up.reshape(1, -1) + 0.01)
-    assert rest.level_names[-1] == "|s|^2 / 2 at 30" and rest.stable == [True]
+    assert rest.level_names[-1] == "|s|^2 / 2 at 30"
+    assert rest.stable == [True]
     text = str(rest)
-    assert "|s|^2 / 2 at 2, 26 more, |s|^2 / 2 at 29" in text and "26 more" in str(lt.linearise(system, up))
+    assert "|s|^2 / 2 at 2, 26 more, |s|^2 / 2 at 29" in text
+    assert "26 more" in str(lt.linearise(system, up))

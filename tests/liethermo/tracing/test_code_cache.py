@@ -229,6 +229,20 @@ def test_other_constants_shapes_and_functions_are_other_programs(folder, loaded_
     assert len(list(folder.glob("*.xla"))) == 3
 
 
+def test_programs_that_differ_in_unused_arguments_are_other_programs(folder, loaded_programs):
+    def choose(i):
+        @programs.jit_cached
+        def exponential_of_one(*arrays):
+            return jnp.exp(arrays[i])
+
+        return exponential_of_one
+
+    first, second, shorter = jnp.zeros(3), jnp.ones(3), jnp.zeros(0)
+    for i, arrays in ((0, (first, second)), (1, (first, second)), (0, (first, shorter)), (0, (first, second))):
+        assert np.allclose(run_in_new_process(choose(i), *arrays), np.exp(arrays[i]), rtol=1e-15)
+    assert loaded_programs == [False, False, False, True]
+
+
 @pytest.mark.parametrize(
     "damage", [lambda code: code[:-7], lambda code: with_checksum(b"no program"), lambda code: b""]
 )
