@@ -330,17 +330,13 @@ class StepChecker:
 
     def _field_change_by_rounding(self, steps: StepSample) -> np.ndarray:
         """Return the magnitude, shape (m, blocks), above which the field of a block is more than rounding."""
-        x, perturbed_x = steps.x, steps.x.copy()
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], x.shape[1])  # a direction along no axis of the system
-        for block in self.system.state_blocks:
-            perturbed_x[:, block] += (
-                ROUNDING_SLOPE_RTOL * np.abs(x[:, block]).max(axis=1, initial=0.0, keepdims=True) * signs[block]
-            )
-        field, perturbed_field = np.split(
-            self._field(np.tile(steps.trajectory, 2), np.concatenate([x, perturbed_x])), 2
-        )
-        change = np.nan_to_num(np.abs(perturbed_field - field), nan=0.0, posinf=0.0)
-        return self._max_by_block(change)
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], steps.x.shape[1])  # a direction along no axis
+        perturbed_x, sizes = steps.x.copy(), ROUNDING_SLOPE_RTOL * self._max_by_block(np.abs(steps.x))
+        for block, size in zip(self.system.state_blocks, sizes.T, strict=True):
+            perturbed_x[:, block] += size[:, None] * signs[block]
+        fields = self._field(np.tile(steps.trajectory, 2), np.concatenate([steps.x, perturbed_x]))
+        change = np.abs(np.subtract(*np.split(fields, 2)))
+        return self._max_by_block(np.nan_to_num(change, nan=0.0, posinf=0.0))
 
     def _field_rounding(self, steps: StepSample) -> np.ndarray:
         """Return the rounding scale of the field in each block; a bath adds terms that may cancel in the body."""
@@ -415,10 +411,11 @@ class RunEvidence:
         sample = select_step_sample(
             self.system, self.x[: len(h) + 1], self.t[: len(h) + 1], h, self.replay.states_after_steps
         )
-        return StepChecker(self.system, self._evaluate, self.replay, min_motion).complete(evidence, sample)
 
-    def _evaluate(self, function: Callable, trajectory: np.ndarray, x: np.ndarray) -> Any:
-        return evaluate_at_points(function, self.system, x)
+        def evaluate(function: Callable, trajectory: np.ndarray, x: np.ndarray) -> Any:
+            return evaluate_at_points(function, self.system, x)
+
+        return StepChecker(self.system, evaluate, self.replay, min_motion).complete(evidence, sample)
 
 
 @dataclass(frozen=True, eq=False)
