@@ -23,8 +23,8 @@ from .joint_states import (
     JointRange,
     TreeSystem,
     broadcast_batches,
-    joint_damping,
     kinetic_and_spring_terms,
+    make_joint_damping,
     sum_of_terms,
 )
 
@@ -60,7 +60,7 @@ class BodiesOnGround(TreeSystem, TorqueSystem):
         terms = kinetic_and_spring_terms(mechanism, springs)
         if gravity is not None:
             terms.append(WeightPotential(mechanism, gravity))
-        dissipation = joint_damping(damping, 0)
+        dissipation = make_joint_damping(damping, 0)
         k, validate = mechanism.n_joints, False  # the axioms hold for every tree
         self._build(mf.Canonical(k), 2 * k, sum_of_terms(terms), None, dissipation, (), validate, baths=baths)
 
@@ -95,7 +95,7 @@ class BodiesOnGround(TreeSystem, TorqueSystem):
         temperature=None,
         degrees: bool = False,
     ) -> jax.Array:
-        """Return a state, from joint coordinates and rates, or from an array of its components.
+        """Make a state of shape (2 k,) from joint coordinates and rates by name, or check an array of components.
 
         Parameters
         ----------
@@ -126,8 +126,8 @@ class BodiesOnGround(TreeSystem, TorqueSystem):
             if degrees or any(value is not None for value in (joints, joint_rates, temperature)):
                 raise InputError("give a state x, or joints and rates by name, not both")
             return super().state(x, batch)
-        q = self._joint_vector(joints, "joints", degrees)
-        q, rates = broadcast_batches(q, self._joint_vector(joint_rates, "joint_rates", degrees))
+        q = self._joint_vector_from_names(joints, "joints", degrees)
+        q, rates = broadcast_batches(q, self._joint_vector_from_names(joint_rates, "joint_rates", degrees))
         momenta = jnp.einsum("...ij,...j->...i", self.mass_matrix(q), rates)
         x = self._append_entropies(jnp.concatenate([q, momenta], axis=-1), temperature)
         return super().state(x, x.ndim > 1)
