@@ -13,8 +13,8 @@ from typing import Any
 REPOSITORY_ROOT = Path(__file__).parent.parent
 
 
-def run_child(measurement: str, *arguments: str, cache: str | None = None, one_core: bool = False) -> Any:
-    """Return the result of ``child(*arguments)`` of a measurement, run in a new process with LIETHERMO_CACHE =
+def run_in_child_process(measurement: str, *arguments: str, cache: str | None = None, one_core: bool = False) -> Any:
+    """Call ``child(*arguments)`` of a measurement in a new process and return its result; LIETHERMO_CACHE is
     ``cache``."""
     options = ["--one-core"] if one_core else []
     return json.loads(

@@ -31,7 +31,7 @@ COMPARED_STEPS = 300
 def library_run(
     system: lt.System, steps: int, engine: Engine, save_every: int | None = None
 ) -> Callable[[], lt.Solution]:
-    """Return a run of the library from :data:`.suites.X0`, which saves only the final state by default."""
+    """Return a function that runs the library from :data:`.suites.X0`; by default it saves only the final state."""
     span, midpoint = (0.0, STEP_SIZE * steps), lt.MetriplecticMidpoint()
     return functools.partial(
         lt.integrate, system, X0, span, STEP_SIZE, midpoint, save_every=save_every or steps, engine=engine
@@ -41,12 +41,12 @@ def library_run(
 def c_run(
     program: BodyProgram, steps: int, save_every: int | None = None
 ) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
-    """Return a run of a C program from :data:`.suites.X0`, with the arguments of :func:`library_run`."""
+    """Return a function that runs a C program from :data:`.suites.X0`, as :func:`library_run` does."""
     return functools.partial(program.integrate, X0, STEP_SIZE, steps, save_every)
 
 
-def race_one_trajectory(caption: str, works: Mapping[str, Callable], steps: int, rounds: int, baseline: str):
-    """Race runs of ``steps`` steps in one thread; return a table, and the processor seconds of each.
+def race_runs_of_one_trajectory(caption: str, works: Mapping[str, Callable], steps: int, rounds: int, baseline: str):
+    """Time runs of equal length against each other in one thread; return a table, and the processor seconds by name.
 
     Returns
     -------
@@ -60,8 +60,8 @@ def race_one_trajectory(caption: str, works: Mapping[str, Callable], steps: int,
         if isinstance(solution, lt.Solution):
             iterations, run_laws = solution.stats.iterations_per_step, laws.solution_laws(solution)
         else:
-            run = solution[1]
-            iterations, run_laws = float((run["iterations"] / run["steps"])[0]), laws.c_run_laws(run)
+            c_record = solution[1]
+            iterations, run_laws = float((c_record["iterations"] / c_record["steps"])[0]), laws.c_run_laws(c_record)
         rows.append([name, times[name] / steps, ratio(times[name], times.get(baseline)), iterations])
         rows[-1] += run_laws.table_cells()
     columns = {"": "text", "Time a step": "seconds", f"Relative to {baseline}": "ratio", "Iterations a step": "number"}
@@ -77,13 +77,15 @@ def max_difference_from_c(program: BodyProgram, system: lt.System) -> float:
     RuntimeError
         As for :func:`require_same_scheme`.
     """
-    ours = library_run(system, COMPARED_STEPS, "compiled", 1)().x[1:]
-    theirs, _ = program.integrate(X0, STEP_SIZE, COMPARED_STEPS, 1)
-    return require_same_scheme(float(np.abs(ours - theirs).max() / np.abs(ours).max()), COMPARED_STEPS)
+    library_states = library_run(system, COMPARED_STEPS, "compiled", 1)().x[1:]
+    c_states, _ = program.integrate(X0, STEP_SIZE, COMPARED_STEPS, 1)
+    return require_same_scheme(
+        float(np.abs(library_states - c_states).max() / np.abs(library_states).max()), COMPARED_STEPS
+    )
 
 
 def require_same_scheme(difference: float, steps: int) -> float:
-    """Return the difference of two trajectories after ``steps`` steps, if it is small.
+    """Return the difference of two trajectories after some steps; raise RuntimeError if it is not due to rounding.
 
     Raises
     ------

@@ -23,7 +23,7 @@ def library_ensemble(
     method: lt.OneStepMethod | None = None,
     outputs: Literal["final", "summary"] = "final",
 ) -> Callable[[], lt.Ensemble]:
-    """Return a run of all bodies over ``steps`` steps."""
+    """Return a function that runs the library from all initial states over some steps."""
     span, step = (0.0, t_end), t_end / steps
     method = lt.MetriplecticMidpoint() if method is None else method
     return functools.partial(lt.ensemble, system, x0s, span, step, method, outputs=outputs, engine=engine)
@@ -33,11 +33,10 @@ TOLERANCES = tuple(10.0 ** (-n / 4) for n in range(4, 60))
 """Tolerances that are tried, four per decade, beginning with the loosest."""
 
 
-def loosest_tolerance_work(
+def find_loosest_tolerance_run(
     build: Callable, x0s: np.ndarray, exact: np.ndarray, max_error: float
 ) -> tuple[Callable, float, float]:
-    """Return a peer's run with the loosest tolerance whose error is at most ``max_error``, that tolerance, and its
-    error.
+    """Find the loosest tolerance of a peer whose error is at most ``max_error``; return its run, tolerance and error.
 
     Parameters
     ----------
@@ -53,13 +52,13 @@ def loosest_tolerance_work(
 
 
 def max_relative_error(ends, exact: np.ndarray) -> float:
-    """Return the largest error of the first final states, relative to the states."""
+    """Return the largest relative error of the final states for which the exact states are given."""
     errors = np.abs(np.asarray(ends)[: len(exact)] - exact).max(axis=1) / np.abs(exact).max(axis=1)
     return float(errors.max())
 
 
 def ensemble_laws(result: lt.Ensemble) -> Laws:
-    """Return the worst laws of all bodies, over every step.
+    """Return the largest energy drift and the least entropy increment of an ensemble, over every step.
 
     Raises
     ------

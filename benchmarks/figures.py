@@ -60,12 +60,12 @@ def draw_time_ratios(themes: dict[str, list[PeerComparison]], path: Path) -> Non
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    tasks_by_theme = {theme: list(dict.fromkeys(c.work for c in found)) for theme, found in themes.items()}
+    tasks_by_theme = {theme: list(dict.fromkeys(c.work for c in comparisons)) for theme, comparisons in themes.items()}
     n_lines = sum(len(tasks) + 1 for tasks in tasks_by_theme.values())
     with matplotlib.rc_context({"svg.hashsalt": "liethermo", "svg.fonttype": "none", "font.size": 9}):
         figure, axes = plt.subplots(figsize=(4.2, 1.0 + 0.33 * n_lines), layout="constrained")
         label_place: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "va": "center", "fontsize": 9}
-        height, labelled = 0.0, set()
+        height, labelled_peers = 0.0, set()
         for theme, comparisons in themes.items():
             axes.text(0.0, height, theme, weight="bold", **label_place)
             for task in tasks_by_theme[theme]:
@@ -75,9 +75,9 @@ def draw_time_ratios(themes: dict[str, list[PeerComparison]], path: Path) -> Non
                 for c in (c for c in comparisons if c.work == task):
                     peer = next(start for start in PEER_MARKERS if c.peer.startswith(start))
                     marker, colour = PEER_MARKERS[peer]
-                    label = None if peer in labelled else peer
+                    label = None if peer in labelled_peers else peer
                     axes.plot(c.ratio, height + 0.2, marker, color=colour, markersize=6, label=label)
-                    labelled.add(peer)
+                    labelled_peers.add(peer)
             height += 1.1
         ratios = [c.ratio for comparisons in themes.values() for c in comparisons]
         limits = min(ratios, default=1.0) / 1.5, 1.5 * max(ratios, default=1.0)  # without peers there is no ratio
@@ -90,7 +90,7 @@ def draw_time_ratios(themes: dict[str, list[PeerComparison]], path: Path) -> Non
         axes.axvspan(limits[0], 1.0, color="0.96", zorder=-1)
         axes.set_yticks([])
         axes.spines[["top", "right", "left"]].set_visible(False)
-        if labelled:
+        if labelled_peers:
             figure.legend(frameon=False, loc="outside upper left", ncols=4, handletextpad=0.0, columnspacing=0.8)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, metadata={"Date": None})

@@ -59,7 +59,7 @@ class RowPair:
 
 @dataclass(frozen=True)
 class RowFigures:
-    """The figures of a row; the time is infinite if it was not measured, the error or the drift None if absent."""
+    """The measured figures of a row: the time, infinite if there is none, the error and the drift, None if absent."""
 
     seconds: float
     error: float | None
@@ -68,7 +68,7 @@ class RowFigures:
 
 @dataclass(frozen=True)
 class PeerComparison:
-    """The measured figures of a pair."""
+    """The figures of this library and of another program for the same work."""
 
     work: str
     unit: str
@@ -82,7 +82,7 @@ class PeerComparison:
         return self.ours.seconds / self.theirs.seconds
 
 
-def _ensemble_pairs(table: int, work: str) -> list[RowPair]:
+def _row_pairs_of_ensembles(table: int, work: str) -> list[RowPair]:
     return [RowPair("ensemble", table, work, "a body to t = 10", COMPILED_ROW, peer) for peer in ("heyoka", "diffrax")]
 
 
@@ -105,11 +105,11 @@ PAIRS_BY_THEME: dict[str, list[RowPair]] = {
         for peer in ("heyoka", "diffrax", "SciPy")
     ],
     "Many trajectories at equal accuracy": [
-        *_ensemble_pairs(3, "10,000 bodies to 1e-3"),
-        *_ensemble_pairs(4, "10,000 bodies to 1e-5"),
-        *_ensemble_pairs(5, "10,000 bodies to 1e-8"),
-        *_ensemble_pairs(6, "10,000 bodies to 1e-12"),
-        *_ensemble_pairs(2, "10,000 bodies, Gauss of order 6, to 3e-8"),
+        *_row_pairs_of_ensembles(3, "10,000 bodies to 1e-3"),
+        *_row_pairs_of_ensembles(4, "10,000 bodies to 1e-5"),
+        *_row_pairs_of_ensembles(5, "10,000 bodies to 1e-8"),
+        *_row_pairs_of_ensembles(6, "10,000 bodies to 1e-12"),
+        *_row_pairs_of_ensembles(2, "10,000 bodies, Gauss of order 6, to 3e-8"),
         *(
             RowPair("others", table, work, "a state to t = 10", COMPILED_ROW, "heyoka", row_number=2)
             for table, work in enumerate(
@@ -182,11 +182,13 @@ PEER_GROUPS = {
 
 
 def compare_themes(reports: Mapping[str, Report]) -> dict[str, list[PeerComparison]]:
-    """Return the comparisons of each theme whose two rows were measured."""
+    """Return the comparisons by theme, for the pairs of rows that were both measured."""
     pairs_by_theme = {theme: [_compare_rows(reports[p.measurement], p) for p in pairs if p.measurement in reports]
              for theme, pairs in PAIRS_BY_THEME.items()}  # fmt: skip
     return {
-        theme: kept for theme, pairs in pairs_by_theme.items() if (kept := [pair for pair in pairs if pair is not None])
+        theme: measured_pairs
+        for theme, pairs in pairs_by_theme.items()
+        if (measured_pairs := [pair for pair in pairs if pair is not None])
     }
 
 
@@ -201,19 +203,19 @@ def _compare_rows(report: Report, pair: RowPair) -> PeerComparison | None:
     return PeerComparison(pair.work, pair.unit, _row_name(their_row), ours, theirs)
 
 
-def _column(table: Table, start: str) -> int | None:
-    """Return the index of the first column whose heading begins so."""
+def _column_index(table: Table, start: str) -> int | None:
+    """Return the index of the first column whose heading begins with a text."""
     return next((i for i, name in enumerate(table.columns) if name.startswith(start)), None)
 
 
 def _row_figures(table: Table, row: list, pair: RowPair) -> RowFigures:
-    columns = (_column(table, start) for start in (pair.time_column, pair.error_column, pair.drift_column))
+    columns = (_column_index(table, start) for start in (pair.time_column, pair.error_column, pair.drift_column))
     seconds, error, drift = (None if column is None else row[column] for column in columns)
     return RowFigures(math.inf if seconds is None else seconds, error, drift)
 
 
 def _find_row(table: Table, start: str, pair: RowPair) -> list | None:
-    """Return the row of this name, or else one whose name begins so: the one at ``row_number``, or the fastest.
+    """Return the row with a name, or of those whose name begins with it the one at ``row_number`` or the fastest.
 
     Rows without a time, or with an error above ``max_error``, do not count.
     """
@@ -235,9 +237,12 @@ def _row_name(row: list) -> str:
 
 
 def page_sections(reports: Mapping[str, Report]) -> Iterator[str]:
-    """Yield the summary, and a section for each theme."""
+    """Yield the sections of the first page: the summary, and one for each theme."""
     themes = compare_themes(reports)
-    yield "\n".join(f"- {sentence}" for sentence in summary_sentences([c for found in themes.values() for c in found]))
+    yield "\n".join(
+        f"- {sentence}"
+        for sentence in summary_sentences([c for theme_comparisons in themes.values() for c in theme_comparisons])
+    )
     for theme, comparisons in themes.items():
         note = f"\n\n{THEME_NOTES[theme]}" if theme in THEME_NOTES else ""
         yield f"## {theme}{note}" + _comparison_table(comparisons).markdown()
@@ -269,11 +274,11 @@ def _comparison_table(comparisons: list[PeerComparison]) -> Table:
 def summary_sentences(comparisons: list[PeerComparison]) -> Iterator[str]:
     """Yield a sentence on wins and losses for each group of peers, and one on the drift of the energy."""
     for name, starts in PEER_GROUPS.items():
-        ours = sorted((c for c in comparisons if c.peer.startswith(starts)), key=lambda c: c.ratio)
-        if ours:
-            lowest, highest, n_won = ours[0], ours[-1], sum(c.ratio < 1.0 for c in ours)
+        group = sorted((c for c in comparisons if c.peer.startswith(starts)), key=lambda c: c.ratio)
+        if group:
+            lowest, highest, n_won = group[0], group[-1], sum(c.ratio < 1.0 for c in group)
             yield (
-                f"**{name}**: this library is faster in {n_won} of {len(ours)} tasks. It takes {lowest.ratio:.2g} "
+                f"**{name}**: this library is faster in {n_won} of {len(group)} tasks. It takes {lowest.ratio:.2g} "
                 f"times the other's time at best ({lowest.work}) and {highest.ratio:.2g} times at worst "
                 f"({highest.work})."
             )

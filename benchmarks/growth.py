@@ -41,8 +41,8 @@ COLUMNS = {
 
 
 def growth_table(caption: str, names: Iterable[str], steps: int, rounds: int, heading: str = "") -> Table:
-    """Return a table with a row for each algebra, named as in :func:`algebra_by_name`."""
-    return Table(caption, {heading: "text"} | COLUMNS, [_algebra_row(name, steps, rounds) for name in names])
+    """Measure both engines on each algebra and return a table with one row per algebra."""
+    return Table(caption, {heading: "text"} | COLUMNS, [_row_of_algebra(name, steps, rounds) for name in names])
 
 
 def algebra_by_name(name: str) -> mf.LieAlgebra:
@@ -81,13 +81,14 @@ def measure_engines(name: str, steps: int, rounds: int) -> dict:
     return results
 
 
-def _algebra_row(name: str, steps: int, rounds: int) -> list:
+def _row_of_algebra(name: str, steps: int, rounds: int) -> list:
     with tempfile.TemporaryDirectory() as cache:
-        results = child.run_child("dimension", name, str(steps), str(rounds), cache=cache, one_core=True)
+        results = child.run_in_child_process("dimension", name, str(steps), str(rounds), cache=cache, one_core=True)
     array_results, compiled_results = results["array"], results["compiled"]
     engine_laws = [laws.Laws(*results[engine]["laws"]) for engine in ENGINES]
     worst_laws = laws.Laws(
-        max(one.energy_drift for one in engine_laws), min(one.least_entropy_increment or 0.0 for one in engine_laws)
+        max(engine_law.energy_drift for engine_law in engine_laws),
+        min(engine_law.least_entropy_increment or 0.0 for engine_law in engine_laws),
     )
     kind, n = name.split()
     title = n if kind == "bodies" else f"{kind}({n})"

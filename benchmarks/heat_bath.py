@@ -8,7 +8,7 @@ OVERRELAXATION_PASSES = 2
 """Reflections of every spin about its field between two heat-bath passes; they decorrelate at constant energy."""
 
 
-def sample_heat_bath(length: int, temperatures, sweeps: int, seed: int = 0) -> np.ndarray:
+def simulate_heisenberg_heat_bath(length: int, temperatures, sweeps: int, seed: int = 0) -> np.ndarray:
     """Return energy per spin and magnetisation vector after each sweep, shape (temperatures, sweeps, 4).
 
     ``E = -sum s_i . s_j`` on ``length**3`` sites, ``length`` even, periodic. A tenth as many sweeps are made first and

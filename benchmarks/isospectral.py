@@ -26,7 +26,7 @@ class IsospectralMidpoint:
         self.diagonal = 2.0 * s * (s + 1.0)
 
     def stream_matrix(self, W: np.ndarray) -> np.ndarray:
-        """Return P, anti-Hermitian and traceless, with ``Delta P = W``."""
+        """Return the stream matrix P of a vorticity W: anti-Hermitian, traceless, with ``Delta P = W``."""
         P = np.zeros_like(W)
         _solve_laplacian(W, self.spin_z, self.raising, self.diagonal, P)
         return P
@@ -35,7 +35,7 @@ class IsospectralMidpoint:
         return -0.5 * float(np.vdot(self.stream_matrix(W), W).real)
 
     def integrate(self, W: np.ndarray, h: float, steps: int) -> tuple[np.ndarray, float]:
-        """Return the matrix after ``steps`` steps, and the mean number of iterations of a step."""
+        """Take ``steps`` steps from W; return the final matrix and the mean number of iterations per step."""
         n_iterations, change = 0, np.zeros_like(W)
         for _ in range(steps):
             for _ in range(60):

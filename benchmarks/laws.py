@@ -29,7 +29,7 @@ class Laws:
     least_entropy_increment: float | None
 
     @property
-    def are_kept(self) -> bool:
+    def are_satisfied(self) -> bool:
         increment = self.least_entropy_increment
         return self.energy_drift <= tolerance("energy") and (increment is None or increment >= -tolerance("entropy"))
 
@@ -44,7 +44,7 @@ class Laws:
 
 
 def solution_laws(solution: lt.Solution) -> Laws:
-    """Return the laws of a run of the library, over every step."""
+    """Return the energy drift and the least entropy increment of a library run, over every step."""
     audit, entropy = solution.audit(), solution.entropy
     assert entropy is not None
     return Laws(audit.energy_drift, audit.entropy_min_increment / float(np.abs(entropy).max()))
@@ -60,7 +60,7 @@ def c_run_laws(runs: np.ndarray) -> Laws:
 
 
 def path_laws(states: np.ndarray, system: lt.System) -> Laws:
-    """Return the laws of a trajectory, shape (times, n)."""
+    """Return the energy drift and the least entropy increment along the states of a trajectory, shape (times, n)."""
     assert system.entropy is not None
     H, S = np.asarray(system.energy(states)), np.asarray(system.entropy(states))
     increment = float(np.diff(S).min() / np.abs(S).max())

@@ -91,7 +91,7 @@ PROBLEMS = {
 
 
 def simulate_data(problem: Problem, is_quick: bool, seed: int = 0) -> np.ndarray:
-    """Return states to twice the training time, shape (trajectories, times, n)."""
+    """Simulate trajectories of a problem to twice the training time; return states, shape (trajectories, times, n)."""
     random, runs = np.random.default_rng(seed), []
     times = np.arange(round(2 * problem.t_end / problem.step) + 1) * problem.step
     for _ in range(5 if is_quick else problem.n_trajectories):
@@ -104,10 +104,14 @@ def simulate_data(problem: Problem, is_quick: bool, seed: int = 0) -> np.ndarray
 
 
 def _forecast_errors(states: np.ndarray, exact_states: np.ndarray) -> list[float]:
-    """Return mean squares and mean magnitudes of state errors, to the end of the training time and after it."""
+    """Return the mean squares and mean magnitudes of forecast errors, within the training time and after it."""
     half = (exact_states.shape[1] + 1) // 2
     error_parts = [states[:, :half] - exact_states[:, :half], states[:, half:] - exact_states[:, half:]]
-    return [float(f(part)) for f in (lambda e: np.mean(e**2), lambda e: np.mean(np.abs(e))) for part in error_parts]
+    return [
+        float(average(errors))
+        for average in (lambda e: np.mean(e**2), lambda e: np.mean(np.abs(e)))
+        for errors in error_parts
+    ]
 
 
 def _law_errors(energy: np.ndarray, entropy: np.ndarray, energy_spread: float) -> list[float]:
@@ -121,7 +125,7 @@ def compare_models(problem: Problem, is_quick: bool) -> list[list]:
     x = simulate_data(problem, is_quick)
     count = max(1, len(x) // 5)
     half = round(problem.t_end / problem.step) + 1
-    test, train = x[:count], [Trajectory(np.arange(half) * problem.step, own[:half]) for own in x[count:]]
+    test, train = x[:count], [Trajectory(np.arange(half) * problem.step, states[:half]) for states in x[count:]]
     scales = component_and_time_scales(train)
     steps, width, seeds = (50, 8, 1) if is_quick else (problem.steps, 32, problem.n_seeds)
     long_steps = round((2 if is_quick else LONG_RUN_FACTOR) * problem.t_end / problem.step)
@@ -203,7 +207,7 @@ def compare_models(problem: Problem, is_quick: bool) -> list[list]:
 
 
 def problem_report(name: str, is_quick: bool) -> Report:
-    """Measure one of the problems."""
+    """Compare the models on a problem, given by name, and return the report."""
     p = PROBLEMS[name]
     columns = {"Model": "text", "Parameters": "count", "MSE to T": "error", "T to 2 T": "error", "MAE to T": "error"}
     columns |= {"MAE, T to 2 T": "error", "Energy drift": "error", "Least entropy increment": "error"}

@@ -122,7 +122,7 @@ class UnscaledPeer(eqx.Module):
 
 
 def train(peer: PeerModel, data: list[Trajectory], scales: DataScales, steps: int, rate: float, seed: int) -> PeerModel:
-    """Return the peer after derivative matching as in ``lt.learn.fit``."""
+    """Train a peer model by derivative matching, as in ``lt.learn.fit``, and return it."""
     start, unravel = ravel_pytree(peer)
     shapes = tuple(leaf.shape for leaf in jax.tree_util.tree_leaves(peer))
     parameter_vector = losses.ParameterVector(
@@ -141,7 +141,8 @@ def train(peer: PeerModel, data: list[Trajectory], scales: DataScales, steps: in
 def forecast(
     peer: PeerModel, x0: np.ndarray, scales: DataScales, step: float, steps: int
 ) -> tuple[np.ndarray, Callable]:
-    """Return states by RK4, shape (trajectories, steps + 1, n), and a function that gives their energy and entropy."""
+    """Integrate a peer model by RK4; return states, shape (trajectories, steps + 1, n), and a function of these for
+    energy and entropy."""
     h = step / scales.time_scale
 
     def rk4(y, _):

@@ -17,11 +17,11 @@ PACKAGES = "liethermo numpy scipy jax numba llvmlite diffrax heyoka mujoco pyman
 def machine_description() -> dict[str, str]:
     """Return the hardware, the system and the versions of compiler and packages, by name."""
     return {
-        "Processor": _processor(),
+        "Processor": _processor_text(),
         "Cores": str(available_cores()),
         "Memory": f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB",
-        "System": f"{_operating_system()}, {platform.machine()}",
-        "C compiler": _compiler_version(),
+        "System": f"{_operating_system_text()}, {platform.machine()}",
+        "C compiler": _compiler_version_text(),
         "Python": platform.python_version(),
         "Packages": ", ".join(f"{name} {_package_version(name)}" for name in PACKAGES),
     }
@@ -37,7 +37,7 @@ def load_average() -> str:
     return f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
 
 
-def _processor() -> str:
+def _processor_text() -> str:
     path = Path("/proc/cpuinfo")
     lines = path.read_text().splitlines() if path.is_file() else []
     fields: dict[str, str] = {}
@@ -48,14 +48,14 @@ def _processor() -> str:
     return " with ".join([fields.get("model name", platform.machine()), *map(str.upper, vectors[:1])])
 
 
-def _operating_system() -> str:
+def _operating_system_text() -> str:
     try:
         return platform.freedesktop_os_release()["PRETTY_NAME"]
     except (OSError, KeyError, AttributeError):
         return platform.system()
 
 
-def _compiler_version() -> str:
+def _compiler_version_text() -> str:
     command = find_c_compiler()
     if command is None:
         return "none"

@@ -37,8 +37,8 @@ STATUSES = ("completed", "not_converged", "non_finite")
 """Names of the status codes of the C programs."""
 
 
-def run_dtype(components: int) -> np.dtype:
-    """Return the record type ``PeerRun`` of c/midpoint.h for states of n components."""
+def c_run_record_dtype(components: int) -> np.dtype:
+    """Return the NumPy dtype of the C struct ``PeerRun`` in c/midpoint.h, for states of n components."""
     vectors = [(name, "f8", components) for name in ("x", "low", "k", "before")]
     energies = ["energy", "entropy", "first_energy", "largest_energy", "smallest_energy"]
     increments = ["least_entropy_increment", "largest_energy_increment"]
@@ -67,8 +67,8 @@ def find_c_compiler() -> str | None:
     return shutil.which(os.environ.get("CC", "cc"))
 
 
-def solver_definitions() -> list[str]:
-    """Return the library's solver options as macro definitions for the compiler."""
+def solver_option_macros() -> list[str]:
+    """Return compiler options that define the library's solver options as C macros."""
     return [f"-D{name.upper()}={getattr(DEFAULT_OPTIONS, name)!r}" for name in SHARED_OPTIONS]
 
 
@@ -88,7 +88,7 @@ def compile_library(source: str, *options: str) -> ctypes.CDLL:
     arguments = [
         command,
         *COMPILER_OPTIONS,
-        *solver_definitions(),
+        *solver_option_macros(),
         *options,
         str(SOURCE_FOLDER / source),
         "-o",
@@ -120,10 +120,10 @@ class BodyProgram:
 
     def integrate(self, x0, step: float, steps: int, save_every: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Take ``steps`` steps from x0; return every n-th state, by default the last, and a record of
-        :func:`run_dtype`."""
+        :func:`c_run_record_dtype`."""
         save_every = steps if save_every is None else save_every
         x0 = np.ascontiguousarray(x0, dtype=float)
-        saves, run = steps // save_every, np.zeros(1, run_dtype(len(x0)))
+        saves, run = steps // save_every, np.zeros(1, c_run_record_dtype(len(x0)))
         states = np.empty((saves, len(x0)))
         self._library.integrate(
             _pointer(self._parameters),
@@ -134,7 +134,7 @@ class BodyProgram:
             _pointer(states),
             _pointer(run),
         )
-        _require_success(run)
+        _require_all_succeeded(run)
         return states, run
 
 
@@ -157,7 +157,7 @@ class EnsembleProgram:
             ctypes.c_int64(threads),
             _pointer(records),
         )
-        _require_success(records)
+        _require_all_succeeded(records)
         return records
 
 
@@ -179,7 +179,7 @@ class SpinRingProgram:
             ctypes.c_int64(steps),
             _pointer(record),
         )
-        _require_success(record)
+        _require_all_succeeded(record)
         return x, record
 
 
@@ -197,8 +197,8 @@ class HeunProgram:
     def __init__(self, edge: int, exchange: float, axis: float, rate: float):
         self._library, self._parameters = compile_library("heun.c"), (exchange, axis, rate)
         index = np.arange(edge**3, dtype=np.int32).reshape(edge, edge, edge)
-        shifted = [np.roll(index, shift, axis=a) for a in range(3) for shift in (1, -1)]
-        self._neighbours = np.ascontiguousarray(np.stack(shifted, axis=-1).reshape(-1, len(shifted)))
+        shifted_indices = [np.roll(index, shift, axis=a) for a in range(3) for shift in (1, -1)]
+        self._neighbours = np.ascontiguousarray(np.stack(shifted_indices, axis=-1).reshape(-1, len(shifted_indices)))
 
     def integrate(self, spins, step: float, steps: int, temperature: float = 0.0) -> np.ndarray:
         """Return the spins, shape (count, 3), after ``steps`` steps in a bath of this temperature."""
@@ -226,7 +226,7 @@ def _pointer(array: np.ndarray) -> ctypes.c_void_p:
     return array.ctypes.data_as(ctypes.c_void_p)
 
 
-def _require_success(records: np.ndarray) -> None:
+def _require_all_succeeded(records: np.ndarray) -> None:
     worst_status = int(records["status"].max())
     if worst_status != 0:
         raise RuntimeError(f"a C program stopped early: {STATUSES[worst_status]}, after {records['steps'].min()} steps")

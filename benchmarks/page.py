@@ -93,8 +93,8 @@ def write_pages(results: Path, page: Path, runs: Path = RUNS_FILE) -> None:
     machines, differing = _machine_section(result_files)
     parts = [RUNS_INTRODUCTION, machines, _target_section(targets)]
     for name, report in reports.items():
-        on_a_page = name in first_page.LEARNING_MEASUREMENTS
-        parts.append(f"## {report.title}\n\nOn the page of learned systems." if on_a_page else report.markdown())
+        has_its_page = name in first_page.LEARNING_MEASUREMENTS
+        parts.append(f"## {report.title}\n\nOn the page of learned systems." if has_its_page else report.markdown())
         if name in differing:
             parts.append(f"Measured elsewhere: {differing[name]}.")
         if report.series:
@@ -122,15 +122,17 @@ def _machine_section(results: list[dict]) -> tuple[str, dict[str, str]]:
     other_machines = {result["name"]: result["machine"] for result in results if result["machine"] != usual}
     differing = {
         name: "; ".join(
-            f"{part} {_additions(text, usual.get(part))}" for part, text in machine.items() if usual.get(part) != text
+            f"{part} {_items_missing_in_usual_text(text, usual.get(part))}"
+            for part, text in machine.items()
+            if usual.get(part) != text
         )
         for name, machine in other_machines.items()
     }
     return "## Machine" + table.markdown(), differing
 
 
-def _additions(text: str, usual: str | None) -> str:
-    """Return the items of an enumeration that the usual one lacks."""
+def _items_missing_in_usual_text(text: str, usual: str | None) -> str:
+    """Return the items of an enumeration that are missing in the usual one, as text."""
     return ", ".join(part for part in text.split(", ") if part not in (usual or "").split(", "))
 
 

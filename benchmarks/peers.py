@@ -90,11 +90,11 @@ def _scipy_field(rate: float) -> Callable:
 def diffrax_run(solver: str, tolerance: float, x0, t_end: float, rate: float) -> PeerRun:
     """Return a run by a Runge-Kutta method of diffrax, by name, with its PID controller."""
     dfx, x0 = import_peer("diffrax"), np.asarray(x0, dtype=float)
-    end = _diffrax_end(solver, t_end, rate)
+    end = _diffrax_final_state(solver, t_end, rate)
 
     def path():
         saveat = dfx.SaveAt(t0=True, steps=True)
-        times, states = _diffrax_solve(solver, t_end, rate, saveat, 100_000)(x0, tolerance)
+        times, states = _compile_diffrax_solve(solver, t_end, rate, saveat, 100_000)(x0, tolerance)
         return np.asarray(states)[np.isfinite(np.asarray(times))]
 
     return PeerRun(lambda: np.asarray(end(x0, tolerance)), path)
@@ -102,23 +102,23 @@ def diffrax_run(solver: str, tolerance: float, x0, t_end: float, rate: float) ->
 
 def diffrax_ensemble(solver: str, tolerance: float, x0s: np.ndarray, t_end: float, rate: float) -> Callable:
     """Return a function that gives the final states from all x0s, computed under ``vmap``."""
-    ends = _diffrax_ends(solver, t_end, rate)
+    ends = _diffrax_final_states(solver, t_end, rate)
     return lambda: np.asarray(ends(x0s, tolerance))
 
 
 @functools.cache
-def _diffrax_ends(solver: str, t_end: float, rate: float) -> Callable:
+def _diffrax_final_states(solver: str, t_end: float, rate: float) -> Callable:
     jax = import_peer("jax")
-    return jax.jit(jax.vmap(_diffrax_end(solver, t_end, rate), in_axes=(0, None)))
+    return jax.jit(jax.vmap(_diffrax_final_state(solver, t_end, rate), in_axes=(0, None)))
 
 
 @functools.cache
-def _diffrax_end(solver: str, t_end: float, rate: float) -> Callable:
-    solve = _diffrax_solve(solver, t_end, rate, import_peer("diffrax").SaveAt(t1=True), None)
+def _diffrax_final_state(solver: str, t_end: float, rate: float) -> Callable:
+    solve = _compile_diffrax_solve(solver, t_end, rate, import_peer("diffrax").SaveAt(t1=True), None)
     return import_peer("jax").jit(lambda x0, tolerance: solve(x0, tolerance)[1][0])
 
 
-def _diffrax_solve(solver, t_end, rate, saveat, max_steps) -> Callable:
+def _compile_diffrax_solve(solver, t_end, rate, saveat, max_steps) -> Callable:
     """Return a compiled function that gives diffrax's times and states, or NaN if diffrax gave up."""
     dfx, jax = import_peer("diffrax"), import_peer("jax")
     jnp = jax.numpy
@@ -164,7 +164,7 @@ def heyoka_equations_run(equations: list, tolerance: float, x0, t_end: float) ->
 
     def end():
         reset()
-        _require_time_limit(hy, integrator.propagate_until(t_end)[0])
+        _require_reached_end_time(hy, integrator.propagate_until(t_end)[0])
         return integrator.state.copy()
 
     def path():
@@ -224,7 +224,7 @@ def heyoka_ensemble(tolerance: float, x0s: np.ndarray, t_end: float, rate: float
 
     def ends():
         outcomes = hy.ensemble_propagate_until_batch(integrator, t_end, batches, start)
-        return np.stack([one[0].state for one in outcomes]).swapaxes(1, 2).reshape(-1, 3)[: len(x0s)]
+        return np.stack([outcome[0].state for outcome in outcomes]).swapaxes(1, 2).reshape(-1, 3)[: len(x0s)]
 
     return ends
 
@@ -256,6 +256,6 @@ def equations_for_heyoka(field: Callable, dim: int) -> list:
     return list(zip(variables, derivatives, strict=True))
 
 
-def _require_time_limit(hy, outcome) -> None:
+def _require_reached_end_time(hy, outcome) -> None:
     if outcome != hy.taylor_outcome.time_limit:
         raise RuntimeError(f"heyoka stopped early: {outcome}")

@@ -18,8 +18,7 @@ STIFFNESS = 0.1
 
 
 def body_field(x, y, z, rate):
-    """Return the field of the relaxed rigid body for the peers, three scalars: ``Pi' = (Pi + rate Omega × Pi) ×
-    Omega``.
+    """Return the three components of the vector field ``Pi' = (Pi + rate Omega × Pi) × Omega`` of the relaxed body.
 
     It is plain arithmetic, so that numba, JAX and heyoka can each compile it.
     """
@@ -56,12 +55,12 @@ def general_body(rate: float) -> lt.LiePoissonSystem:
 
 
 def body_parameters(rate: float) -> list[float]:
-    """Return the ``Problem`` of c/rigid_body.c and c/ensemble.c."""
+    """Return the parameters of the C programs c/rigid_body.c and c/ensemble.c, in the order of their ``Problem``."""
     return [*(1.0 / moment for moment in INERTIA), rate]
 
 
 def general_parameters(rate: float) -> list[float]:
-    """Return the ``Problem`` of c/general.c."""
+    """Return the parameters of the C program c/general.c, in the order of its ``Problem``."""
     return [*body_parameters(rate), STIFFNESS]
 
 

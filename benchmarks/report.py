@@ -104,14 +104,14 @@ def targets_table(targets: Sequence[Target]) -> Table:
 
 
 def build_available(builders: Mapping[Any, Callable[[], Any]]) -> tuple[dict[Any, Any], dict[Any, str]]:
-    """Return the results of the builders, and the reasons of those that raise :class:`UnavailableError`."""
-    works, skipped = {}, {}
+    """Call builders by name; return the results, and the reasons of those that raise :class:`UnavailableError`."""
+    works, skip_reasons = {}, {}
     for name, build in builders.items():
         try:
             works[name] = build()
         except UnavailableError as reason:
-            skipped[name] = str(reason)
-    return works, skipped
+            skip_reasons[name] = str(reason)
+    return works, skip_reasons
 
 
 def ratio(a: float | None, b: float | None) -> float | None:
@@ -119,7 +119,7 @@ def ratio(a: float | None, b: float | None) -> float | None:
 
 
 def _escape_bars(text: str) -> str:
-    """Escape bars in the text, which would separate cells of the table."""
+    """Return a text with escaped bars, which would separate the cells of a Markdown table."""
     return text.replace("|", r"\|")
 
 

@@ -39,12 +39,12 @@ class TumblingBody:
     damping: float = 0.0
 
     @property
-    def hub(self) -> np.ndarray:
+    def hub_moments(self) -> np.ndarray:
         """Moments of inertia of the body without the wheel, a disc about the second axis."""
         return self.inertia - 0.5 * self.wheel * np.array([1.0, 0.0, 1.0])
 
     @property
-    def disc(self) -> np.ndarray:
+    def wheel_moments(self) -> np.ndarray:
         return self.wheel * np.array([0.5, 1.0, 0.5])
 
     def momentum(self, omega, spin) -> np.ndarray:
@@ -56,7 +56,7 @@ class TumblingBody:
         return 0.5 * np.sum(self.inertia * omega**2, axis=-1) + 0.5 * self.wheel * (omega[..., 1] + spin) ** 2
 
     def angular_velocities(self, momentum, wheel) -> tuple[np.ndarray, np.ndarray]:
-        """Return the angular velocity and the wheel's spin, from the momentum and the wheel's momentum."""
+        """Return the angular velocity and the wheel's spin, from the angular momenta of the body and of the wheel."""
         rest = momentum - np.multiply.outer(wheel, [0.0, 1.0, 0.0])
         omega = rest / self.inertia
         return omega, (wheel / self.wheel - omega[..., 1] if self.wheel else np.zeros_like(wheel))
@@ -92,7 +92,7 @@ def _motion_record(body: TumblingBody, omega, spin, attitude, total=None) -> Mot
 
 
 def _rotation_matrices(q) -> np.ndarray:
-    """Return rotation matrices, shape (..., 3, 3), of quaternions with the scalar first."""
+    """Convert quaternions with the scalar first to rotation matrices, shape (..., 3, 3)."""
     w, v = q[..., 0, None, None], q[..., 1:]
     hat = np.cross(v[..., None, :], np.eye(3)).swapaxes(-1, -2)
     return np.eye(3) + (2.0 * w * hat + 2.0 * hat @ hat) / np.sum(q**2, axis=-1)[..., None, None]
@@ -184,12 +184,12 @@ def _scipy_field(body: TumblingBody) -> Callable:
 MUJOCO_MODEL = """
 <mujoco>
   <option gravity="0 0 0" timestep="{step}" integrator="{integrator}"><flag contact="disable"/></option>
-  <worldbody><body><freejoint/><inertial pos="0 0 0" mass="1" diaginertia="{hub}"/>{wheel}</body></worldbody>
+  <worldbody><body><freejoint/><inertial pos="0 0 0" mass="1" diaginertia="{hub_moments}"/>{wheel}</body></worldbody>
 </mujoco>
 """
 """MuJoCo's description of the body."""
 MUJOCO_WHEEL = """
-<body><inertial pos="0 0 0" mass="1e-6" diaginertia="{disc}"/>
+<body><inertial pos="0 0 0" mass="1e-6" diaginertia="{wheel_moments}"/>
   <joint type="hinge" axis="0 1 0" damping="{damping}"/></body>
 """
 """MuJoCo's description of the wheel."""
@@ -200,7 +200,7 @@ def mujoco_run(
 ) -> Callable[[], MotionRecord]:
     """Return a run of MuJoCo with a free body and a wheel on a hinge; MuJoCo's own loop takes the steps."""
     mj = import_peer("mujoco")
-    numbers = {name: " ".join(map(str, getattr(body, name))) for name in ("hub", "disc")}
+    numbers = {name: " ".join(map(str, getattr(body, name))) for name in ("hub_moments", "wheel_moments")}
     wheel = MUJOCO_WHEEL.format(damping=body.damping, **numbers) if body.wheel else ""
     model = mj.MjModel.from_xml_string(MUJOCO_MODEL.format(step=step, integrator=integrator, wheel=wheel, **numbers))
     steps_per_record = round(t_end / step / times)
@@ -247,7 +247,7 @@ def basilisk_run(body: TumblingBody, step: float, t_end: float, times: int) -> C
         simulation = simulations.SimBaseClass()
         simulation.CreateNewProcess("process").addTask(simulation.CreateNewTask("task", macros.sec2nano(step)))
         craft = spacecraft.Spacecraft()
-        craft.hub.mHub, craft.hub.IHubPntBc_B = 1.0, np.diag(body.hub).tolist()
+        craft.hub.mHub, craft.hub.IHubPntBc_B = 1.0, np.diag(body.hub_moments).tolist()
         craft.hub.omega_BN_BInit = [[w] for w in INITIAL_ANGULAR_VELOCITY]
         simulation.AddModelToTask("task", craft)
         record_interval = macros.sec2nano(t_end / times)
@@ -255,7 +255,7 @@ def basilisk_run(body: TumblingBody, step: float, t_end: float, times: int) -> C
         if body.wheel:
             wheel = spinning_body.SpinningBodyOneDOFStateEffector()
             wheel.mass, wheel.k, wheel.c = 1e-6, 0.0, body.damping
-            wheel.IPntSc_S, wheel.dcm_S0B = np.diag(body.disc).tolist(), np.eye(3).tolist()
+            wheel.IPntSc_S, wheel.dcm_S0B = np.diag(body.wheel_moments).tolist(), np.eye(3).tolist()
             wheel.sHat_S = [[0.0], [1.0], [0.0]]
             craft.addStateEffector(wheel)
             simulation.AddModelToTask("task", wheel)

@@ -18,7 +18,7 @@ time."""
 
 @dataclass(frozen=True)
 class TimedResult:
-    """The best times of a work, and its result.
+    """The best wall and processor time of a callable, and its result.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class TimedResult:
 
 
 def race(works: Mapping[Any, Callable[[], Any]], *, rounds: int, max_seconds: float = 20.0) -> dict[Any, TimedResult]:
-    """Time each work by turns.
+    """Call each work by turns, and return the best time of each with its result.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def race(works: Mapping[Any, Callable[[], Any]], *, rounds: int, max_seconds: fl
     for turn in range(rounds):
         for name, work in works.items():
             if turn < 2 or spent_seconds[name] < max_seconds:
-                turn_seconds, total = _time_turn(work)
+                turn_seconds, total = _repeat_and_time(work)
                 best_seconds[name] = (
                     min(best_seconds[name][0], turn_seconds[0]),
                     min(best_seconds[name][1], turn_seconds[1]),
@@ -67,17 +67,17 @@ def race(works: Mapping[Any, Callable[[], Any]], *, rounds: int, max_seconds: fl
 
 
 def time_once(work: Callable[[], Any]) -> TimedResult:
-    """Time a work that can be done only once, such as compiling."""
+    """Time one call of a work that can be done only once, such as compiling."""
     start, start_processor = time.perf_counter(), time.process_time()
     result = work()
     return TimedResult(time.perf_counter() - start, time.process_time() - start_processor, result)
 
 
-def _time_turn(work) -> tuple[tuple[float, float], float]:
+def _repeat_and_time(work) -> tuple[tuple[float, float], float]:
     seconds = processor = float("inf")
     total = 0.0
     while total < MIN_TURN_SECONDS:
-        timed = time_once(work)
-        seconds, processor = min(seconds, timed.wall_seconds), min(processor, timed.cpu_seconds)
-        total += timed.wall_seconds
+        timed_result = time_once(work)
+        seconds, processor = min(seconds, timed_result.wall_seconds), min(processor, timed_result.cpu_seconds)
+        total += timed_result.wall_seconds
     return (seconds, processor), total

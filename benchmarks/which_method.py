@@ -38,11 +38,11 @@ class Problem:
     reference_step: float  # of the reference
 
 
-def _rigid_body() -> lt.System:
+def _rigid_body_problem() -> lt.System:
     return lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
 
 
-def _four_dimensional_body() -> lt.System:
+def _four_dimensional_body_problem() -> lt.System:
     g = mf.so(4)
     inertia = jnp.array([1.0, 1.5, 2.0, 2.5, 3.0, 3.5])
     return lt.LiePoissonSystem(
@@ -53,13 +53,13 @@ def _four_dimensional_body() -> lt.System:
     )
 
 
-def _oscillator() -> lt.System:
+def _oscillator_problem() -> lt.System:
     return lt.EvolutionSystem(
         lt.Kinetic([1.0]) + lt.Potential(lambda q, S: 0.5 * q @ q + 0.1 * jnp.sum(q**4) + jnp.exp(S / 2.0)), dim=3
     )
 
 
-def _stiff_exchange() -> lt.System:
+def _stiff_exchange_problem() -> lt.System:
     def block_energy(x):
         return 0.5 * x[1] ** 2 + jnp.exp(x[2])
 
@@ -74,10 +74,12 @@ def _stiff_exchange() -> lt.System:
 
 
 PROBLEMS = (
-    Problem("relaxing body, so(3)", _rigid_body, (0.06, 0.1, 1.0), 40.0, 0.05),
-    Problem("body in four dimensions, so(4)", _four_dimensional_body, (0.9, 0.3, -0.5, 0.2, 0.6, -0.4), 20.0, 0.05),
-    Problem("oscillator and its heat", _oscillator, (1.0, 0.0, -2.0), 20.0, 0.05),
-    Problem("stiff exchange of heat", _stiff_exchange, (2.0, 0.0, 0.4, 0.0), 10.0, 0.002),
+    Problem("relaxing body, so(3)", _rigid_body_problem, (0.06, 0.1, 1.0), 40.0, 0.05),
+    Problem(
+        "body in four dimensions, so(4)", _four_dimensional_body_problem, (0.9, 0.3, -0.5, 0.2, 0.6, -0.4), 20.0, 0.05
+    ),
+    Problem("oscillator and its heat", _oscillator_problem, (1.0, 0.0, -2.0), 20.0, 0.05),
+    Problem("stiff exchange of heat", _stiff_exchange_problem, (2.0, 0.0, 0.4, 0.0), 10.0, 0.002),
 )
 """The four problems."""
 
@@ -93,7 +95,7 @@ METHODS = (
 
 
 def measure_methods(problem: Problem) -> dict[str, list[tuple[float, float]]]:
-    """Return points (error, evaluations) for each method; steps that fail from some state are left out."""
+    """Return points (error, evaluations) for each method, without step sizes that fail."""
     system, span = problem.build_system(), (0.0, problem.t_end)
     states = np.array(problem.initial_state) * (
         1.0 + 0.1 * np.random.default_rng(0).standard_normal((N_RUNS, system.dim))

@@ -54,7 +54,7 @@ def _print_version(is_requested: bool) -> None:
 
 
 @app.callback()
-def _options(
+def _top_level_options(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Say the version and exit.")
     ] = False,
@@ -177,7 +177,7 @@ def check(spec: SpecFile, change: SetOptions = None, allow: AllowedModules = Non
     """Validate a spec file and test the axioms of its system at random points, without running it."""
     from .spec import read
 
-    plan = read(spec, change or (), allow or (), lambda what: typer.echo(f"{spec}: {what}"))
+    plan = read(spec, change or (), allow or (), lambda source_text: typer.echo(f"{spec}: {source_text}"))
     if plan.study is not None:
         from .spec.reading import build_study
 
@@ -243,7 +243,7 @@ def _prepare_result_folder(spec: Path, folder: Path) -> Path:
 
 
 def _draw_figures(plan: Spec, system: System, solution: Solution, folder: Path) -> list[str]:
-    """Draw the figures of a spec; return the names of their files."""
+    """Draw the figures that a spec file asks for, and return the names of their files."""
     os.environ.setdefault("MPLBACKEND", "agg")  # write files without a display
     from .results import plot
 
@@ -281,13 +281,13 @@ def _dask_client(address: str | None, folder: Path) -> Iterator[Any]:
         return
     from distributed import Client
 
-    from .spec.trust import pickling_by_value
+    from .spec.trust import pickle_spec_modules_by_value
 
     try:
         client = Client(address, timeout=20)
     except (OSError, ValueError) as error:
         raise FileError(f"there is no Dask scheduler at {address}: {error}") from error
-    with client, pickling_by_value(folder):
+    with client, pickle_spec_modules_by_value(folder):
         yield client
 
 

@@ -81,7 +81,7 @@ def remove_abandoned_files(folder: Path, name: str) -> None:
 
 
 def is_abandoned(partial_file: Path) -> bool:
-    """Return True if the process that wrote this partial file has ended."""
+    """Return True if the process that wrote a partial file has ended, from the process id in its name."""
     match = PART_NAME_PATTERN.fullmatch(partial_file.name)
     if match is None:
         return False
@@ -98,7 +98,7 @@ def is_abandoned(partial_file: Path) -> bool:
 
 @contextlib.contextmanager
 def file_errors(action: str, path: str | os.PathLike, advice: str = "") -> Iterator[None]:
-    """Raise FileError with the path and the cause where the operating system refuses to read or write.
+    """Convert operating-system errors in a block to FileError, with the path and the cause.
 
     Parameters
     ----------

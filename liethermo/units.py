@@ -13,7 +13,7 @@ from .errors import InputError
 
 
 class Unit(NamedTuple):
-    """A unit as a factor and an offset: a value in SI units is ``factor * value + offset``.
+    """A unit of measurement: a value in SI units is ``factor * value + offset``.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class Unit(NamedTuple):
     dimension: tuple[tuple[str, int], ...]
 
     def to_si(self, values: Any) -> np.ndarray:
-        """Return values in this unit as values in SI units."""
+        """Convert values in this unit to SI units."""
         return self.factor * np.asarray(values, dtype=np.float64) + self.offset
 
 
@@ -120,7 +120,7 @@ FACTOR_PATTERN = re.compile(r"([^\d\s*/^.·-][^\s*/^.·\d-]*0?|1)(?:(?:\^|\*\*)?
 
 
 def parse_unit(name: str) -> Unit:
-    """Return a unit by its name: a unit, or a product or quotient of powers, such as ``rad/s^2``, ``N m`` or ``m s-1``.
+    """Parse the name of a unit, or of a product or quotient of powers, such as ``rad/s^2``, ``N m`` or ``m s-1``.
 
     Raises
     ------
@@ -132,19 +132,19 @@ def parse_unit(name: str) -> Unit:
     if text in TEMPERATURE_OFFSETS:
         return Unit(*TEMPERATURE_OFFSETS[text], (("K", 1),))
     factor, exponents = 1.0, dict[str, int]()
-    for i, part in enumerate(text.split("/")):
-        position, part = 0, re.sub(r"(?<!\*)\*(?!\*)|[·.]", " ", part).strip()
-        if not part and text:
+    for i, product_text in enumerate(text.split("/")):
+        position, product_text = 0, re.sub(r"(?<!\*)\*(?!\*)|[·.]", " ", product_text).strip()
+        if not product_text and text:
             raise InputError(f"unknown unit {name!r}. {_known_units_text(name)}")
-        while position < len(part):
-            match = FACTOR_PATTERN.match(part, position)
-            if match is None or (unit := _simple_unit(match[1])) is None:
+        while position < len(product_text):
+            match = FACTOR_PATTERN.match(product_text, position)
+            if match is None or (unit := _find_unit_without_exponent(match[1])) is None:
                 raise InputError(f"unknown unit {name!r}. {_known_units_text(match[1] if match else name)}")
             power = int(match[2] or 1) * (1 if i == 0 else -1)
             factor *= unit[0] ** power
             for base_unit, exponent in unit[1].items():
                 exponents[base_unit] = exponents.get(base_unit, 0) + power * exponent
-            position = match.end() + len(part[match.end() :]) - len(part[match.end() :].lstrip())
+            position = match.end() + len(product_text[match.end() :]) - len(product_text[match.end() :].lstrip())
     return Unit(factor, 0.0, tuple(sorted((base, exponent) for base, exponent in exponents.items() if exponent)))
 
 
@@ -153,14 +153,14 @@ QUANTITY_PATTERN = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s
 
 
 def quantity_in_si(text: str) -> float:
-    """Return the number in SI units of a text with a number and a unit, such as ``0.5 deg/s``.
+    """Parse a text with a number and a unit, such as ``0.5 deg/s``, and return the number in SI units.
 
     It is a difference: 1 degC is 1 K.
 
     Raises
     ------
     InputError
-        If it is no number with a known unit.
+        If it is not a number with a known unit.
     """
     match = QUANTITY_PATTERN.fullmatch(text)
     if match is None:
@@ -168,23 +168,23 @@ def quantity_in_si(text: str) -> float:
     return float(match[1]) * parse_unit(match[2]).factor
 
 
-def _simple_unit(name: str) -> tuple[float, dict[str, int]] | None:
-    """Return the factor and the exponents of a unit without exponent; None if it is not known."""
+def _find_unit_without_exponent(name: str) -> tuple[float, dict[str, int]] | None:
+    """Return the SI factor and the dimension exponents of a unit name without exponent; None if it is unknown."""
     name = SYNONYMS.get(name, name)
     if len(name) >= MIN_WORD_LENGTH and name.lower() != name:  # RPM and Kelvin
-        lower_case_unit = _simple_unit(name.lower())
-        if name not in OTHER_UNITS and lower_case_unit is not None and _prefixed_unit(name) is None:
+        lower_case_unit = _find_unit_without_exponent(name.lower())
+        if name not in OTHER_UNITS and lower_case_unit is not None and _find_prefixed_unit(name) is None:
             return lower_case_unit
     if name in OTHER_UNITS:
         return OTHER_UNITS[name]
     if "/" in name:
         unit = parse_unit(name)
         return unit.factor, dict(unit.dimension)
-    return _prefixed_unit(name)
+    return _find_prefixed_unit(name)
 
 
-def _prefixed_unit(name: str) -> tuple[float, dict[str, int]] | None:
-    """Return the factor and the exponents of an SI unit with a prefix; None if it is not known."""
+def _find_prefixed_unit(name: str) -> tuple[float, dict[str, int]] | None:
+    """Return the SI factor and the dimension exponents of a unit name with an SI prefix; None if it is unknown."""
     for prefix, factor in PREFIXES.items():
         if name.startswith(prefix) and (exponents := SI_UNITS.get(name[len(prefix) :])) is not None:
             return factor * (1e-3 if name.endswith("g") else 1.0), exponents
@@ -192,7 +192,7 @@ def _prefixed_unit(name: str) -> tuple[float, dict[str, int]] | None:
 
 
 def _known_units_text(name: str) -> str:
-    """Return advice that names the known unit nearest to an unknown one."""
+    """Return a sentence for error messages that names the known unit nearest to an unknown one."""
     names = [*SI_UNITS, *OTHER_UNITS, *TEMPERATURE_OFFSETS, *SYNONYMS, *(p + u for p in PREFIXES for u in SI_UNITS)]
     nearest = [AMBIGUOUS[name]] if name in AMBIGUOUS else difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     hint = f"Did you mean {nearest[0]!r}? " if nearest else ""
@@ -207,7 +207,8 @@ LABEL_PATTERN = re.compile(r"(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*", re.DO
 
 
 def split_label(label: str) -> tuple[str, str]:
-    """Return the name and the unit of a column, "" without one: ``omega_x [deg/s]`` and ``omega_x (deg/s)``."""
+    """Split the label of a column into name and unit, "" if it has no unit: ``omega_x [deg/s]`` and ``omega_x
+    (deg/s)``."""
     match = LABEL_PATTERN.fullmatch(label)
     unit = "" if match is None else (match[2] if match[2] is not None else match[3]).strip()
     if match is None or re.fullmatch(r"[\d, ]*", unit):  # x[0] is a component

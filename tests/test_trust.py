@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import liethermo as lt
 from liethermo.cli import app
 from liethermo.spec import read
-from liethermo.spec.trust import pickling_by_value
+from liethermo.spec.trust import pickle_spec_modules_by_value
 
 RUN = "[run]\ninitial = [0.1, 1.0, 0.1]\nt_span = [0.0, 1.0]\nstep = 0.1\n"
 MINE = """
@@ -107,7 +107,7 @@ import sys
 from pathlib import Path
 import liethermo as lt
 from liethermo.spec import read
-from liethermo.spec.trust import pickling_by_value
+from liethermo.spec.trust import pickle_spec_modules_by_value
 assert "xarray" not in sys.modules
 try:
     read(Path(sys.argv[1]))
@@ -139,7 +139,7 @@ def test_modules_beside_the_spec_are_sent_to_workers(folder):
     assert (
         "No module named 'mine_of_trust'" in subprocess.run(command, capture_output=True, text=True, check=False).stderr
     )
-    with pickling_by_value(folder):
+    with pickle_spec_modules_by_value(folder):
         pickle_file.write_bytes(cloudpickle.dumps(build))
     process = subprocess.run(command, capture_output=True, text=True, check=False)
     assert process.stdout.strip() == "LiePoissonSystem", process.stderr

@@ -39,7 +39,7 @@ def run(is_quick: bool) -> Report:
     rows: list[list] = []
     skip_reasons: dict[str, str] = {}
     for bodies in ensemble_counts:
-        row, skip_reasons = _ensemble_row(bodies, rounds)
+        row, skip_reasons = _measure_ensemble_row(bodies, rounds)
         rows.append(row)
     columns = {"Bodies": "count"} | dict.fromkeys(["Compiled", "Array", "C with SIMD"], "seconds")
     caption = (
@@ -51,7 +51,7 @@ def run(is_quick: bool) -> Report:
     return Report("Number of bodies", text, [one_system, ensembles], skipped=skip_reasons)
 
 
-def _ensemble_row(bodies: int, rounds: int) -> tuple[list, dict[str, str]]:
+def _measure_ensemble_row(bodies: int, rounds: int) -> tuple[list, dict[str, str]]:
     x0s, system = random_states(bodies), quadratic_body(RATE)
     engines = [e for e in growth.ENGINES if e == "compiled" or bodies <= MAX_ARRAY_BODIES]
     works: dict[str, Callable] = {e: library_ensemble(system, x0s, T_END, STEPS, e) for e in engines}

@@ -45,9 +45,12 @@ def run(is_quick: bool) -> Report:
     rounds, rows, targets = 1 if is_quick else 5, [], []
     body, x0 = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2), np.array([0.1, 0.2, 1.0])
     for method in (lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(8)):
-        times = race({name: _repeat(call) for name, call in _calls(body, x0, method).items()}, rounds=rounds)
-        for name, timed in times.items():
-            seconds = timed.cpu_seconds / CALLS_PER_TIMING
+        times = race(
+            {name: _repeat_call(call) for name, call in _plain_and_prepared_call(body, x0, method).items()},
+            rounds=rounds,
+        )
+        for name, timed_result in times.items():
+            seconds = timed_result.cpu_seconds / CALLS_PER_TIMING
             rows.append([str(method), name, seconds])
             if name in MAX_SECONDS and method == lt.MetriplecticGauss(2):
                 targets.append(Target(f"{name}, two steps of {method}", MAX_SECONDS[name], seconds, "seconds"))
@@ -73,15 +76,17 @@ def _heyoka_table(is_quick: bool) -> tuple[Table, list[Target]]:
             for method in (lt.MetriplecticRungeKutta(8), lt.MetriplecticTaylor(12))
             if (propagator := _coarsest_propagator(body, method, x0, exact, error)) is not None
         }
-        times = race({name: _repeat(call) for name, call in {**works, **ours}.items()}, rounds=1 if is_quick else 5)
-        seconds = {name: timed.cpu_seconds / CALLS_PER_TIMING for name, timed in times.items()}
-        peer_seconds, fastest = seconds.get("heyoka"), min(seconds[name] for name in ours)
+        times = race(
+            {name: _repeat_call(call) for name, call in {**works, **ours}.items()}, rounds=1 if is_quick else 5
+        )
+        seconds = {name: timed_result.cpu_seconds / CALLS_PER_TIMING for name, timed_result in times.items()}
+        peer_seconds, min_seconds = seconds.get("heyoka"), min(seconds[name] for name in ours)
         rows += [
             [f"to {error:.0e}, {name}", value, None if peer_seconds is None else value / peer_seconds]
             for name, value in seconds.items()
         ]
         if peer_seconds is not None:
-            ratio = fastest / peer_seconds
+            ratio = min_seconds / peer_seconds
             targets.append(Target(f"a body to {error:.0e}, beside heyoka, both prepared", 1.0, ratio, "ratio"))
     caption = (
         f"One body to t = {BODY_SPAN[1]:g}, from a state to the last state, in the longest steps with at most this "
@@ -110,7 +115,10 @@ def _coarsest_propagator(body, method, x0, exact, error) -> lt.Propagator | None
     return None
 
 
-def _calls(body: lt.System, x0: np.ndarray, method: lt.OneStepMethod) -> dict[str, Callable[[], object]]:
+def _plain_and_prepared_call(
+    body: lt.System, x0: np.ndarray, method: lt.OneStepMethod
+) -> dict[str, Callable[[], object]]:
+    """Return calls for one short run by name: prepared by ``Propagator``, and by ``integrate``."""
     propagator = lt.Propagator(body, method, STEP_SIZE)
     rates = iter(np.linspace(0.1, 0.3, 1_000_003))
     return {
@@ -123,7 +131,7 @@ def _calls(body: lt.System, x0: np.ndarray, method: lt.OneStepMethod) -> dict[st
     }
 
 
-def _repeat(call: Callable[[], object]) -> Callable[[], None]:
+def _repeat_call(call: Callable[[], object]) -> Callable[[], None]:
     def repeat() -> None:
         for _ in range(CALLS_PER_TIMING):
             call()

@@ -10,7 +10,7 @@ import numpy as np
 import liethermo as lt
 
 from .. import laws, peers, reference
-from ..ensembles import ensemble_laws, library_ensemble, loosest_tolerance_work, max_relative_error
+from ..ensembles import ensemble_laws, find_loosest_tolerance_run, library_ensemble, max_relative_error
 from ..machine import available_cores
 from ..native import SUMMARY_DTYPE, EnsembleProgram
 from ..problems import body_parameters, quadratic_body, random_states
@@ -135,7 +135,7 @@ def _race_method(name: str, method: lt.OneStepMethod, steps: int, x0s: np.ndarra
 def _peer_work(build: Callable, x0s: np.ndarray, exact: np.ndarray, max_error: float) -> tuple[Callable, str]:
     """Return a peer's run with the loosest tolerance whose error is at most ``max_error``, and that tolerance as
     text."""
-    work, tolerance, _ = loosest_tolerance_work(
+    work, tolerance, _ = find_loosest_tolerance_run(
         lambda tolerance, states: build(tolerance, states, T_END, RATE), x0s, exact, max_error
     )
     return work, f"tolerance {tolerance:.1e}"

@@ -39,7 +39,9 @@ def run(is_quick: bool) -> Report:
     rows, targets = [], []
     for N in sizes:
         steps, rounds = (2, 1) if is_quick else (max(4, 10_240 // N), 1 if N > 256 else 3)
-        new_rows, ratio = process.run_child("fluids", "plain", str(N), str(steps), str(rounds), one_core=True)
+        new_rows, ratio = process.run_in_child_process(
+            "fluids", "plain", str(N), str(steps), str(rounds), one_core=True
+        )
         rows += new_rows
         if not is_quick and N in (128, 256):
             targets.append(
@@ -76,7 +78,7 @@ def magnetic_tables(is_quick: bool) -> tuple[list[Table], list[Target]]:
     steps, rounds, long_steps = (4, 1, 20) if is_quick else (40, 3, LONG_RUN_STEPS)
     rows, targets = [], []
     for N in sizes:
-        results = process.run_child("fluids", "beside", str(N), str(steps), str(rounds), one_core=True)
+        results = process.run_in_child_process("fluids", "beside", str(N), str(steps), str(rounds), one_core=True)
         rows.append([N, *results, results[1] / results[0]])
         targets.append(Target(f"a step with a magnetic field beside one without, su({N})", 2.5, rows[-1][-1]))
     step_table = Table(
@@ -87,7 +89,7 @@ def magnetic_tables(is_quick: bool) -> tuple[list[Table], list[Target]]:
     )
     invariant_rows, runs = [], [(12, 0.0)] if is_quick else [(64, 0.0), (64, MAGNETIC_RATE), (128, 0.0), (256, 0.0)]
     for N, rate in runs:
-        results = process.run_child("fluids", "kept", str(N), str(long_steps), str(rate))
+        results = process.run_in_child_process("fluids", "kept", str(N), str(long_steps), str(rate))
         invariant_rows.append([N, "ideal" if rate == 0.0 else "with friction", *results])
         if rate == 0.0:
             work = f"{long_steps:,} steps of a magnetic fluid, su({N}): energy, cross helicity and tr B^3"
@@ -178,14 +180,16 @@ def race_isospectral(*numbers: str):
     h = TURN_PER_STEP / (q.gamma * np.abs(np.linalg.eigvalsh(1j * scheme.stream_matrix(W))).max() * 2.0)
     system = lt.models.zeitlin(N, "enstrophy", DECAY_RATE)
     span, method = (0.0, h * steps), METHOD
-    ours = functools.partial(lt.integrate, system, x, span, h, method, save_every=steps, engine="array", progress=False)
+    library_result = functools.partial(
+        lt.integrate, system, x, span, h, method, save_every=steps, engine="array", progress=False
+    )
     peer = functools.partial(scheme.integrate, W, h * q.gamma, steps)
     outcomes = race(
-        {"isospectral midpoint, no dissipation": peer, "this library, selective decay": ours}, rounds=rounds
+        {"isospectral midpoint, no dissipation": peer, "this library, selective decay": library_result}, rounds=rounds
     )
-    (name, theirs), (own_name, mine) = outcomes.items()
-    W_end, iterations = theirs.result
-    solution = mine.result
+    (name, peer_outcome), (own_name, library_outcome) = outcomes.items()
+    W_end, iterations = peer_outcome.result
+    solution = library_outcome.result
     energy = solution.stats.energy_range
     min_energy, max_energy = energy if energy is not None else (solution.energy.min(), solution.energy.max())
     drift, energy_change = (
@@ -193,10 +197,10 @@ def race_isospectral(*numbers: str):
         (max_energy - min_energy) / abs(solution.energy[0]),
     )
     casimir_changes = _casimir_changes(W, np.asarray(q.matrix(solution.x[-1])))
-    ratio = float(mine.cpu_seconds / theirs.cpu_seconds)
+    ratio = float(library_outcome.cpu_seconds / peer_outcome.cpu_seconds)
     rows = [
-        [N, name, theirs.cpu_seconds / steps, 1.0, drift, *_casimir_changes(W, W_end), iterations],
-        [N, own_name, mine.cpu_seconds / steps, ratio, float(energy_change), *casimir_changes, None],
+        [N, name, peer_outcome.cpu_seconds / steps, 1.0, drift, *_casimir_changes(W, W_end), iterations],
+        [N, own_name, library_outcome.cpu_seconds / steps, ratio, float(energy_change), *casimir_changes, None],
     ]
     return rows, ratio
 

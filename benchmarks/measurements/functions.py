@@ -26,12 +26,12 @@ KNOTS = jnp.linspace(-3.0, 3.0, 400)
 """Grid of the interpolation and of the scan."""
 
 
-def definite_matrix(m):
+def positive_definite_matrix(m):
     """Return a positive definite matrix with distinct eigenvalues."""
     return jnp.diag(jnp.array([2.0, 4.0, 7.0])) + 0.3 * jnp.outer(m, m)
 
 
-def newton_root(s):
+def square_root_by_newton(s):
     """Return the square root by Newton's method in a ``while_loop``."""
 
     def is_inaccurate(root):
@@ -41,17 +41,17 @@ def newton_root(s):
 
 
 FUNCTIONS = {
-    "`while_loop`, a square root": lambda m: newton_root(1.0 + m @ m),
+    "`while_loop`, a square root": lambda m: square_root_by_newton(1.0 + m @ m),
     "`scan`, 400 passes": lambda m: lax.scan(lambda c, t: (c + 0.01 * jnp.cos(t * m[0] + c), None), m[2], KNOTS)[0],
     "`cond`": lambda m: lax.cond(m[1] > 9.0, lambda a: jnp.sin(a[0]), lambda a: a[0] ** 4, m),
     "`interp`": lambda m: jnp.interp(m[0] ** 3 + m[1], KNOTS, 0.5 * KNOTS),
     "complex numbers": lambda m: jnp.abs((m[0] + 1j * m[1] + 2.0) ** 3 * jnp.exp(0.1j * m[2])),
-    "`eigvalsh`, 3 × 3": lambda m: jnp.sum(jnp.exp(0.2 * jnp.linalg.eigvalsh(definite_matrix(m)))),
-    "`solve`, 3 × 3": lambda m: m @ jnp.linalg.solve(definite_matrix(m), m),
-    "`slogdet`, 3 × 3": lambda m: jnp.linalg.slogdet(definite_matrix(m))[1],
-    "`svd`, 3 × 3": lambda m: jnp.sum(jnp.linalg.svd(definite_matrix(m), compute_uv=False)),
-    "`cholesky`, 3 × 3": lambda m: jnp.sum(jnp.log(jnp.diag(jnp.linalg.cholesky(definite_matrix(m))))),
-    "`expm`, 3 × 3": lambda m: 0.1 * jnp.trace(jax.scipy.linalg.expm(0.3 * definite_matrix(m))),
+    "`eigvalsh`, 3 × 3": lambda m: jnp.sum(jnp.exp(0.2 * jnp.linalg.eigvalsh(positive_definite_matrix(m)))),
+    "`solve`, 3 × 3": lambda m: m @ jnp.linalg.solve(positive_definite_matrix(m), m),
+    "`slogdet`, 3 × 3": lambda m: jnp.linalg.slogdet(positive_definite_matrix(m))[1],
+    "`svd`, 3 × 3": lambda m: jnp.sum(jnp.linalg.svd(positive_definite_matrix(m), compute_uv=False)),
+    "`cholesky`, 3 × 3": lambda m: jnp.sum(jnp.log(jnp.diag(jnp.linalg.cholesky(positive_definite_matrix(m))))),
+    "`expm`, 3 × 3": lambda m: 0.1 * jnp.trace(jax.scipy.linalg.expm(0.3 * positive_definite_matrix(m))),
     "`lgamma`": lambda m: special.gammaln(4.0 + m[0]),
     "Bessel functions": lambda m: special.i0(m[0]) + special.i1e(m[1]),
 }

@@ -9,7 +9,7 @@ from ..contest import (
     c_run,
     library_run,
     max_difference_from_c,
-    race_one_trajectory,
+    race_runs_of_one_trajectory,
 )
 from ..native import BodyProgram
 from ..problems import general_body, general_parameters
@@ -37,7 +37,7 @@ def run(is_quick: bool) -> Report:
         }
     )
     caption = f"A run of {steps:,} steps of size {STEP_SIZE}, relaxing all the way (rate {rate:g}); one state kept."
-    table, times = race_one_trajectory(caption, works, steps, rounds, C_ROW)
+    table, times = race_runs_of_one_trajectory(caption, works, steps, rounds, C_ROW)
     text = (
         "A quartic energy and a logarithmic entropy on so(3)*, given to the library as plain functions and to C with "
         "derivatives by hand. *C* evaluates the library's form of Gonzalez's gradient: three gradients and one value "

@@ -53,7 +53,7 @@ C_ROW = "C, 1 threads"
 def run(is_quick: bool) -> Report:
     """Measure functions and noise, each size in a process of its own."""
     sizes, edges = ((1_000,), (4,)) if is_quick else (SIZES, EDGES)
-    seconds_by_size = {n: process.run_child("large", "functions", str(n)) for n in sizes}
+    seconds_by_size = {n: process.run_in_child_process("large", "functions", str(n)) for n in sizes}
     row_names = (PLAIN_ROW, HAND_WRITTEN_ROW, COLUMN_MAJOR_ROW, MODEL_ROW, C_ROW)
     rows = [[n, *(seconds_by_size[n].get(row_name) for row_name in row_names)] for n in sizes]
     columns = {"Sites": "count"} | {row_name[0].upper() + row_name[1:]: "seconds" for row_name in row_names}
@@ -63,7 +63,7 @@ def run(is_quick: bool) -> Report:
         columns,
         rows,
     )
-    noise = {n: process.run_child("large", "noise", str(n)) for n in edges}
+    noise = {n: process.run_in_child_process("large", "noise", str(n)) for n in edges}
     names = ("first", "with", "without", "ratio", "iterations", "iterations without")
     kinds = ("seconds", "seconds", "seconds", "ratio", "number", "number")
     headings = ("First answer", "A spin and step", "Without noise", "Ratio", "Iterations a step", "Without noise ")

@@ -63,11 +63,12 @@ def run(is_quick: bool) -> Report:
     count, rounds = (1_000, 1) if is_quick else (N_SPINS, 5)
     system, x0 = spin_ring(count), random_spins(count)
 
-    def theirs(threads: int, steps: int):
+    def run_c_program(threads: int, steps: int):
         return SpinRingProgram([EXCHANGE, AXIS, RATE, count]).integrate(x0, STEP, steps, threads)
 
     candidates = {
-        f"C, {threads} threads": lambda threads=threads: functools.partial(theirs, threads) for threads in THREADS
+        f"C, {threads} threads": lambda threads=threads: functools.partial(run_c_program, threads)
+        for threads in THREADS
     }
     c_works, skip_reasons = build_available(candidates)
     works = {name: functools.partial(work, LONG_STEPS) for name, work in c_works.items()}
@@ -101,8 +102,8 @@ def run(is_quick: bool) -> Report:
         "each iteration, its derivatives written by hand, with the same stopping rules."
     )
     if c_works:
-        ours = outcomes["array engine"].result.x[-1]
-        difference = np.abs(outcomes["C, 1 threads"].result[0] - ours).max() / np.abs(ours).max()
+        library_states = outcomes["array engine"].result.x[-1]
+        difference = np.abs(outcomes["C, 1 threads"].result[0] - library_states).max() / np.abs(library_states).max()
         text += (
             f" After {LONG_STEPS} steps the states differ by {require_same_scheme(float(difference), LONG_STEPS):.0e}."
         )
@@ -163,9 +164,9 @@ def dipole_table(edges) -> Table:
         for borders, is_periodic in (("open", False), ("periodic", True)):
             lattice = lt.magnetism.lattice("sc", (edge,) * 3, periodic=is_periodic)
             exchange = lt.magnetism.exchange(lattice, EXCHANGE)
-            both = exchange + lt.magnetism.dipoles(lattice, 1.0, DIPOLE_STRENGTH)
+            exchange_and_dipoles = exchange + lt.magnetism.dipoles(lattice, 1.0, DIPOLE_STRENGTH)
             works = {}
-            for name, energy in (("without", exchange), ("with", both)):
+            for name, energy in (("without", exchange), ("with", exchange_and_dipoles)):
                 system = lt.SpinSystem(lattice, energy, lt.LandauLifshitz(RATE))
                 x0 = system.state(spins)
                 works[name] = functools.partial(library_run, system, x0, method=METHODS["explicit 4"])
@@ -180,7 +181,7 @@ def dipole_table(edges) -> Table:
 def seconds_per_step(works: dict, steps: int) -> dict[str, float]:
     """Return the processor seconds of a step of each work, a function of ``steps``, without the call itself."""
     runs = {(name, n): functools.partial(work, steps=n) for name, work in works.items() for n in (SHORT_STEPS, steps)}
-    seconds = {run: timed.cpu_seconds for run, timed in race(runs, rounds=CUBE_ROUNDS).items()}
+    seconds = {run: timed_result.cpu_seconds for run, timed_result in race(runs, rounds=CUBE_ROUNDS).items()}
     return {name: (seconds[name, steps] - seconds[name, SHORT_STEPS]) / (steps - SHORT_STEPS) for name in works}
 
 
@@ -189,7 +190,7 @@ def growth_table(sizes) -> Table:
     rows = []
     for method in METHODS:
         for count in sizes:
-            results = process.run_child("lattice", method, str(count))
+            results = process.run_in_child_process("lattice", method, str(count))
             row = [method, count, results["first"], results["step"], results["step"] / count, results["iterations"]]
             rows.append([*row, results["peak"], results["lengths"], *laws.Laws(*results["laws"]).table_cells()])
     columns = {"Method": "text", "Spins": "count", "The first call": "seconds", "A step": "seconds"}

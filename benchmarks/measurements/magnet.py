@@ -10,7 +10,7 @@ import numpy as np
 import liethermo as lt
 from liethermo.functions.magnetism.transitions import autocorrelation_time
 
-from ..heat_bath import sample_heat_bath
+from ..heat_bath import simulate_heisenberg_heat_bath
 from ..report import Report, Table, Target
 
 CRITICAL_TEMPERATURE = 1.4429
@@ -45,7 +45,7 @@ MIN_CROSSING_BLOCKS = 20
 
 @dataclass(frozen=True)
 class Series:
-    """Energy per spin and magnetisation vector along a run in equilibrium, shape (n, 4)."""
+    """Time series of energy per spin and magnetisation vector of a run in equilibrium, shape (n, 4)."""
 
     generator: str
     length: int
@@ -78,7 +78,7 @@ class Series:
 
     @property
     def row_indices(self) -> np.ndarray:
-        """Indices of all rows."""
+        """Indices of all rows of the samples."""
         return np.arange(len(self.samples))
 
     def drop_transient(self) -> Series:
@@ -102,7 +102,7 @@ def specific_heat(series: Series, rows) -> float:
     return float(series.energy[rows].var() * series.length**3 / series.temperature**2)
 
 
-def with_error(quantity, series: Series) -> tuple[float, float]:
+def value_and_jackknife_error(quantity, series: Series) -> tuple[float, float]:
     """Return a quantity and its jackknife standard error."""
     return quantity(series, series.row_indices), float(
         np.sqrt(jackknife_variance(lambda row_indices: quantity(series, row_indices), series))
@@ -161,11 +161,11 @@ def run(is_quick: bool) -> Report:
         ]
     temperatures = sorted([CRITICAL_TEMPERATURE, *STEP_SHARE_BY_TEMPERATURE])
     for length, sweeps in ({4: 200} if is_quick else SWEEPS_BY_LENGTH).items():
-        chains = sample_heat_bath(length, temperatures, sweeps)
+        chains = simulate_heisenberg_heat_bath(length, temperatures, sweeps)
         runs += [
             [Series(MONTE_CARLO_ROW, length, T, sweeps, 1, rows)] for T, rows in zip(temperatures, chains, strict=True)
         ]
-    series_list = [join_runs(some) for some in runs]
+    series_list = [join_runs(runs_at_temperature) for runs_at_temperature in runs]
     critical_series = [
         series for series in series_list if series.generator == NOISE_ROW and series.temperature == CRITICAL_TEMPERATURE
     ]
@@ -175,7 +175,7 @@ def run(is_quick: bool) -> Report:
 def series_row(series: Series) -> list:
     """Return a row of the table: the results of a series with their standard errors."""
     cumulant = lt.magnetism.binder_cumulant(series.magnetisation_vectors)
-    quantities = [*(with_error(f, series) for f in (magnetisation, specific_heat)), tuple(cumulant)]
+    quantities = [*(value_and_jackknife_error(f, series) for f in (magnetisation, specific_heat)), tuple(cumulant)]
     times = series.autocorrelation_time * series.steps_per_row
     return [series.generator, series.length, f"{series.temperature:g}", series.steps, times, *sum(quantities, ())]
 

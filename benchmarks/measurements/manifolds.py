@@ -64,7 +64,7 @@ def run(is_quick: bool) -> Report:
         for space in chart_spaces
         for row in (rows_by_space[space.name][0], *_space_rows(space, RETRACTION_BY_SPACE[space.name], steps))
     ]
-    rows = [row for own in rows_by_space.values() for row in own]
+    rows = [row for space_rows in rows_by_space.values() for row in space_rows]
     text = (
         "A system with an energy and an entropy that are not quadratic, and the metric of the space projected off the "
         "energy, from its definition to the end of a run; then many steps, of which one state is kept. RK4 comes first "
@@ -91,8 +91,8 @@ def run(is_quick: bool) -> Report:
             )
         )
     for name, max_value in (("S^2", 6.0), ("SPD(3)", 6.0), ("St(4, 2)", 12.0)):
-        own = [row[6] for row in rk4_rows if row[0] == name]
-        targets.append(Target(f"a step on {name} over one on R^d", max_value, own[0] if own else None))
+        space_rows = [row[6] for row in rk4_rows if row[0] == name]
+        targets.append(Target(f"a step on {name} over one on R^d", max_value, space_rows[0] if space_rows else None))
     tables = [
         Table(caption, COLUMNS, rows),
         Table("Steps of order 4 without charts, and in those of `retraction=`.", COLUMNS, chart_rows),
@@ -115,10 +115,10 @@ def run(is_quick: bool) -> Report:
 
 
 def _space_rows(space: mf.Space, way: str, steps: int) -> list[list]:
-    number = [other.name for other in mf.registered_spaces()].index(space.name)
+    number = [registered_space.name for registered_space in mf.registered_spaces()].index(space.name)
     with tempfile.TemporaryDirectory() as cache:
-        cold = processes.run_child("manifolds", str(number), way, str(steps), cache=cache)
-        warm = processes.run_child("manifolds", str(number), way, "0", cache=cache)
+        cold = processes.run_in_child_process("manifolds", str(number), way, str(steps), cache=cache)
+        warm = processes.run_in_child_process("manifolds", str(number), way, "0", cache=cache)
     title = "" if way == "around" else f', retraction="{way}"'
     return [
         [
@@ -150,7 +150,7 @@ def child(number: str, way: str, steps: str) -> dict[str, list]:
         return results
     euclidean = mf.Euclidean(space.dim)
     euclidean_system, start = relaxing(euclidean), np.asarray(euclidean.random(3))
-    exact = _exact_end(system, x0)
+    exact = _exact_final_state(system, x0)
     for name, method in methods.items():
         euclidean_seconds = _step_seconds(euclidean_system, start, METHODS[name]) if name == "RK4" else None
         results[name] += [_step_seconds(system, x0, method), euclidean_seconds]
@@ -178,16 +178,16 @@ def relaxing(space: mf.Space) -> lt.MetriplecticSystem:
 
 
 def _step_seconds(system: lt.MetriplecticSystem, x0, method, steps: int = 20_000) -> float:
-    """Return the seconds of a step, the best of several runs."""
+    """Time several runs and return the least processor seconds per step."""
     best_seconds = np.inf
     for _ in range(3):
-        began = time.process_time()
+        start_time = time.process_time()
         lt.integrate(system, x0, (0.0, 0.01 * steps), 0.01, method, save_every=steps)
-        best_seconds = min(best_seconds, time.process_time() - began)
+        best_seconds = min(best_seconds, time.process_time() - start_time)
     return best_seconds / steps
 
 
-def _exact_end(system: lt.MetriplecticSystem, x0) -> np.ndarray:
+def _exact_final_state(system: lt.MetriplecticSystem, x0) -> np.ndarray:
     field = jax.jit(lambda x: system.vector_field(x))
     exact = solve_ivp(lambda t, x: np.asarray(field(x)), (0.0, 1.0), x0, method="DOP853", rtol=1e-13, atol=1e-14)
     return exact.y[:, -1]
@@ -230,7 +230,7 @@ def pymanopt_rows() -> list[list]:
     UnavailableError
         If pymanopt is not installed.
     """
-    theirs, A = peers.import_peer("pymanopt"), np.diag([1.0, 2.0, 4.0]) + 0.3
+    pymanopt, A = peers.import_peer("pymanopt"), np.diag([1.0, 2.0, 4.0]) + 0.3
     sphere, definite, lines = mf.Sphere(2), mf.SPD(2), mf.Grassmann(3, 1)
     quadratic_cost = (lambda x: 0.5 * np.sum(x * (A @ x))), lambda x: A @ x
     volume_cost = (
@@ -239,13 +239,13 @@ def pymanopt_rows() -> list[list]:
     )
     column = np.asarray(sphere.random(1))[:, None]
     cases = [
-        (sphere, lambda x: 0.5 * x @ A @ x, column[:, 0], 1.0, theirs.manifolds.Sphere(3), quadratic_cost),
+        (sphere, lambda x: 0.5 * x @ A @ x, column[:, 0], 1.0, pymanopt.manifolds.Sphere(3), quadratic_cost),
         (
             definite,
             lambda x: jnp.trace(x) - jnp.linalg.slogdet(x)[1],
             np.asarray(definite.random(1)),
             1.0,
-            theirs.manifolds.SymmetricPositiveDefinite(2),
+            pymanopt.manifolds.SymmetricPositiveDefinite(2),
             volume_cost,
         ),
         # projectors change by twice the square of what the vectors do that they project to
@@ -254,7 +254,7 @@ def pymanopt_rows() -> list[list]:
             lambda x: 0.5 * jnp.trace(A @ x),
             column @ column.T,
             2.0,
-            theirs.manifolds.Grassmann(3, 1),
+            pymanopt.manifolds.Grassmann(3, 1),
             quadratic_cost,
         ),
     ]
@@ -263,11 +263,11 @@ def pymanopt_rows() -> list[list]:
         flow = lt.MetriplecticSystem(None, function, dissipation=lt.Friction(), space=space)
         run = lt.integrate(flow, x0, (0.0, t_end), t_end / 100, lt.MetriplecticRungeKutta(8))
         exact = np.asarray(flow.points(run.x[-1]))
-        wrap = theirs.function.numpy(manifold)
-        problem = theirs.Problem(manifold, wrap(cost), euclidean_gradient=wrap(gradient))
+        wrap = pymanopt.function.numpy(manifold)
+        problem = pymanopt.Problem(manifold, wrap(cost), euclidean_gradient=wrap(gradient))
 
         def end(steps, problem=problem, start=column if space is lines else x0):
-            optimizer = theirs.optimizers.SteepestDescent(
+            optimizer = pymanopt.optimizers.SteepestDescent(
                 _FixedStepSearch(1.0 / steps),
                 max_iterations=steps,
                 min_gradient_norm=0.0,

@@ -32,7 +32,7 @@ def run(is_quick: bool) -> Report:
     if not PROCESS_STATUS_FILE.is_file():
         sizes, skip_reasons = (), {"all": "this system does not tell a process its largest size"}
     for bodies in sizes:
-        results = process.run_child("memory", str(bodies))
+        results = process.run_in_child_process("memory", str(bodies))
         peak = results["peak"]
         run_laws = laws.Laws(*results["laws"])
         rows.append([bodies, results["before"], peak, results["seconds"], *run_laws.table_cells()])

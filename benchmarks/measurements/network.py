@@ -38,7 +38,7 @@ def run(is_quick: bool) -> Report:
     for graph in graphs:
         for nodes in sizes:
             for h in (MILD_STEP, STIFF_STEP):
-                results = process.run_child("network", graph, str(nodes), str(h), one_core=True)
+                results = process.run_in_child_process("network", graph, str(nodes), str(h), one_core=True)
                 seconds[graph, nodes, h] = results["step"]
                 row = [
                     graph,

@@ -12,7 +12,7 @@ import liethermo as lt
 import manifolds as mf
 
 from .. import laws, peers
-from ..ensembles import ensemble_laws, library_ensemble, loosest_tolerance_work, max_relative_error
+from ..ensembles import ensemble_laws, find_loosest_tolerance_run, library_ensemble, max_relative_error
 from ..machine import available_cores
 from ..problems import general_body
 from ..report import Report, Table, build_available, ratio
@@ -81,7 +81,7 @@ def _race_heyoka(
         if "heyoka" in heyoka_work:
             build, exact = heyoka_work["heyoka"]
             method_error = max_relative_error(ours().x, exact)
-            works["heyoka"], tolerance, heyoka_error = loosest_tolerance_work(build, x0s, exact, method_error)
+            works["heyoka"], tolerance, heyoka_error = find_loosest_tolerance_run(build, x0s, exact, method_error)
         outcomes = race(works, rounds=1 if is_quick else 5)
         seconds = {title: outcome.wall_seconds / number for title, outcome in outcomes.items()}
         run_laws = ensemble_laws(outcomes["compiled engine"].result)

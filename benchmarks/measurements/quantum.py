@@ -35,22 +35,24 @@ N_SAVED = 20
 """Number of saved states."""
 
 
-def operators(levels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the Hamiltonian with unequal level distances and the coupling of neighbours; no level is empty to
-    rounding."""
+def hamiltonian_and_coupling(levels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a Hamiltonian with unequal level distances, and the operator that couples neighbouring levels.
+
+    The distances are so small that no level is empty to rounding in equilibrium.
+    """
     distances = np.concatenate([[0.0], np.linspace(0.7, 1.3, levels - 1)])
     return np.diag(np.cumsum(distances)), np.diag(np.sqrt(np.arange(1.0, levels)), 1)
 
 
 def thermal_system(levels: int) -> lt.QuantumSystem:
-    H, V = operators(levels)
+    H, V = hamiltonian_and_coupling(levels)
     bath = lt.HeatBaths(capacity=np.inf, temperature=TEMPERATURE)
     return lt.QuantumSystem(H, lt.ThermalJumps([(V, RATE)]), baths=bath)
 
 
 def jump_operators(levels: int) -> list[np.ndarray]:
-    """Return the jump operators of Lindblad's equation, including their rates."""
-    H, V = operators(levels)
+    """Return the jump hamiltonian_and_coupling of Lindblad's equation, including their rates."""
+    H, V = hamiltonian_and_coupling(levels)
     jumps = []
     for i in range(levels - 1):
         lowering, omega = np.zeros((levels, levels)), H[i + 1, i + 1] - H[i, i]
@@ -62,11 +64,11 @@ def jump_operators(levels: int) -> list[np.ndarray]:
 
 def exact_states(levels: int, rho: np.ndarray) -> np.ndarray:
     """Return the density matrices at the early time and at the end."""
-    H, one = operators(levels)[0], np.eye(levels)
-    generator = -1j * (np.kron(H, one) - np.kron(one, H.T))
+    H, identity = hamiltonian_and_coupling(levels)[0], np.eye(levels)
+    generator = -1j * (np.kron(H, identity) - np.kron(identity, H.T))
     for L in jump_operators(levels):
         n = L.T @ L
-        generator += np.kron(L, L.conj()) - 0.5 * (np.kron(n, one) + np.kron(one, n.T))
+        generator += np.kron(L, L.conj()) - 0.5 * (np.kron(n, identity) + np.kron(identity, n.T))
     return np.stack([scipy.linalg.expm(generator * t) @ rho.ravel() for t in (EARLY_TIME, T_END)]).reshape(
         2, levels, levels
     )
@@ -76,7 +78,7 @@ def qutip_work(levels: int, rho: np.ndarray, tolerance: float):
     """Return a run of ``qutip.mesolve`` that gives the density matrices at the early time and at the end."""
     qutip = peers.import_peer("qutip")
     H, *jumps = (
-        qutip.Qobj(L).to("CSR") for L in (operators(levels)[0], *jump_operators(levels))
+        qutip.Qobj(L).to("CSR") for L in (hamiltonian_and_coupling(levels)[0], *jump_operators(levels))
     )  # faster than dense ones
     options = {"rtol": tolerance, "atol": 0.01 * tolerance, "nsteps": 1_000_000}
     times = np.linspace(0.0, T_END, N_SAVED + 1)

@@ -93,7 +93,7 @@ def run(is_quick: bool) -> Report:
             if reason := why_too_large(rows[-1] if rows and rows[-1][0] == kind else None):
                 skip_reasons[f"{kind}, {n:,} sites"] = reason
                 break
-            results = process.run_child("scaling", kind, str(n))
+            results = process.run_in_child_process("scaling", kind, str(n))
             row = [kind, results["sites"], results["engine"], results["first"], results["step"] / results["sites"]]
             rows.append([*row, results["step"], results["peak"]])
     columns = {"System": "text", "Sites": "count", "Engine": "text", "First answer": "seconds"}

@@ -9,7 +9,7 @@ from ..contest import (
     c_run,
     library_run,
     max_difference_from_c,
-    race_one_trajectory,
+    race_runs_of_one_trajectory,
 )
 from ..native import BodyProgram
 from ..problems import body_parameters, function_body, quadratic_body
@@ -37,7 +37,7 @@ def run(is_quick: bool) -> Report:
         }
     )
     caption = f"A run of {steps:,} steps of size {STEP_SIZE}, relaxing all the way (rate {rate:g}); one state kept."
-    table, times = race_one_trajectory(caption, long_works, steps, rounds, C_ROW)
+    table, times = race_runs_of_one_trajectory(caption, long_works, steps, rounds, C_ROW)
 
     short_steps = 100 if is_quick else 1000
     short_works, _ = build_available(
@@ -52,7 +52,7 @@ def run(is_quick: bool) -> Report:
         "times are "
         "mostly what a call costs before and after its steps."
     )
-    calls, call_times = race_one_trajectory(caption, short_works, short_steps, 3 * rounds, C_ROW)
+    calls, call_times = race_runs_of_one_trajectory(caption, short_works, short_steps, 3 * rounds, C_ROW)
     call_seconds = call_times["compiled engine"] - short_steps * times[QUADRATIC_ROW] / steps
 
     text = (

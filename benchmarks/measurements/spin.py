@@ -13,7 +13,7 @@ import liethermo as lt
 import manifolds as mf
 
 from .. import peers
-from ..contest import Engine, race_one_trajectory, require_same_scheme
+from ..contest import Engine, race_runs_of_one_trajectory, require_same_scheme
 from ..ensembles import TOLERANCES
 from ..native import BodyProgram
 from ..report import Report, Table, Target, UnavailableError, build_available, ratio
@@ -66,7 +66,7 @@ def run(is_quick: bool) -> Report:
         works, unavailable = build_available(dict(zip((C_ROW, COMPILED_ROW), runs, strict=True)))
         skip_reasons |= unavailable
         caption = f"{steps:,} steps of size {STEP} {way}, relaxing all the way (rate {rate:g}); one state kept."
-        table, times = race_one_trajectory(caption, works, steps, rounds, C_ROW)
+        table, times = race_runs_of_one_trajectory(caption, works, steps, rounds, C_ROW)
         tables.append(table)
         ratios[way] = ratio(times[COMPILED_ROW], times.get(C_ROW))
         if C_ROW in works:
@@ -193,8 +193,8 @@ def max_difference_from_c(way: str, rate: float = 0.03) -> float:
     RuntimeError
         As for :func:`..contest.require_same_scheme`.
     """
-    ours, (theirs, _) = (
+    library_states, (c_states, _) = (
         library_run(0.03, 300, 1, "compiled", way)().x[1:],
         c_program(rate, way).integrate(X0, STEP, 300, 1),
     )
-    return require_same_scheme(float(np.abs(ours - theirs).max()), 300)
+    return require_same_scheme(float(np.abs(library_states - c_states).max()), 300)

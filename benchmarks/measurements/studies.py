@@ -37,7 +37,7 @@ N_CLUSTER_BODIES = 200_000
 def run(is_quick: bool) -> Report:
     """Measure a large study, small chunks, and a cluster."""
     bodies, chunks, n_cluster_bodies = (2_000, 100, 500) if is_quick else (N_BODIES, N_CHUNKS, N_CLUSTER_BODIES)
-    single_results = [process.run_child("studies", what, str(bodies)) for what in ("bare", "kept")]
+    single_results = [process.run_in_child_process("studies", part_name, str(bodies)) for part_name in ("bare", "kept")]
     overhead = single_results[1]["seconds"] / single_results[0]["seconds"] - 1.0
     columns = {"": "text", "Time": "seconds", "Peak memory": "gigabytes"}
     rows = [
@@ -45,7 +45,7 @@ def run(is_quick: bool) -> Report:
         for name, a in zip(("`ensemble(until=lt.Relaxed(...))`", "`Study`, kept"), single_results, strict=True)
     ]
     time_table = Table(f"The relaxation times of {bodies:,} bodies, each in a process of its own.", columns, rows)
-    chunk_result = process.run_child("studies", "chunks", str(chunks))
+    chunk_result = process.run_in_child_process("studies", "chunks", str(chunks))
     columns = {"Chunks": "count", "Time": "seconds", "A chunk": "seconds"}
     chunk_table = Table(
         "Chunks of one point with one step: what a chunk costs.",
@@ -54,7 +54,7 @@ def run(is_quick: bool) -> Report:
     )
     rows, one_worker_seconds = [], None
     for workers in (1, 2, 4):
-        result = process.run_child("studies", "workers", str(n_cluster_bodies), str(workers))
+        result = process.run_in_child_process("studies", "workers", str(n_cluster_bodies), str(workers))
         one_worker_seconds = one_worker_seconds or result["seconds"]
         rows.append([workers, result["seconds"], one_worker_seconds / result["seconds"]])
     columns = {"Workers": "count", "Time": "seconds", "Speed-up": "ratio"}
@@ -86,21 +86,29 @@ def child(part: str, number: str, workers: str = "1") -> dict:
     return {"seconds": seconds, "peak": peak_resident_bytes()}
 
 
-def _body(point):
+def _body_at_point(point):
     return lt.models.rigid_body(rate=point["rate"])
 
 
-def _rates(count: int) -> np.ndarray:
+def _linspace_rates(count: int) -> np.ndarray:
+    """Return evenly spaced dissipation rates, shape (count,)."""
     return np.linspace(0.5, 2.0, count)
 
 
-def _study(count: int, folder: str, **changes) -> lt.Study:
+def _make_study(count: int, folder: str, **changes) -> lt.Study:
     arguments: dict[str, Any] = {
         "t_span": (0.0, T_END),
         "step": STEP,
         "measure": {"time": lt.Relaxed(RELAXED_TOLERANCE)},
     } | changes
-    return lt.Study(_body, {"rate": _rates(count)}, x0=X0, method=METHOD, store=Path(folder) / "s.zarr", **arguments)
+    return lt.Study(
+        _body_at_point,
+        {"rate": _linspace_rates(count)},
+        x0=X0,
+        method=METHOD,
+        store=Path(folder) / "s.zarr",
+        **arguments,
+    )
 
 
 def _time_ensemble(count: int) -> float:
@@ -113,7 +121,7 @@ def _time_ensemble(count: int) -> float:
             (0.0, T_END),
             STEP,
             METHOD,
-            parameters={"dissipation.rate": _rates(n)},
+            parameters={"dissipation.rate": _linspace_rates(n)},
             outputs="summary",
             until=lt.Relaxed(RELAXED_TOLERANCE),
         )
@@ -133,8 +141,8 @@ def _time_study(study: lt.Study, client=None) -> float:
 
 def _time_stored_study(count: int, **changes) -> float:
     with tempfile.TemporaryDirectory() as warmup_folder, tempfile.TemporaryDirectory() as folder:
-        _time_study(_study(100, warmup_folder, **changes))
-        return _time_study(_study(count, folder, **changes))
+        _time_study(_make_study(100, warmup_folder, **changes))
+        return _time_study(_make_study(count, folder, **changes))
 
 
 def _time_small_chunks(count: int) -> float:
@@ -147,5 +155,5 @@ def _time_cluster_study(count: int, workers: int) -> float:
     cluster = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
     folders = tempfile.TemporaryDirectory(), tempfile.TemporaryDirectory()
     with cluster, Client(cluster) as client, folders[0] as warmup_folder, folders[1] as folder:
-        _time_study(_study(64 * workers, warmup_folder, chunk=8), client)
-        return _time_study(_study(count, folder, chunk=4096), client)
+        _time_study(_make_study(64 * workers, warmup_folder, chunk=8), client)
+        return _time_study(_make_study(count, folder, chunk=4096), client)

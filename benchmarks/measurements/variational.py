@@ -10,7 +10,7 @@ import numpy as np
 import liethermo as lt
 from liethermo.models.gases import MASS_SPRING_CASES
 
-from ..contest import race_one_trajectory, require_same_scheme
+from ..contest import race_runs_of_one_trajectory, require_same_scheme
 from ..native import BodyProgram
 from ..report import Report, Target, build_available, ratio
 
@@ -47,7 +47,7 @@ def run(is_quick: bool) -> Report:
                 COMPILED_ROW: functools.partial(library_run, number, steps, steps),
             }
         )
-        table, times = race_one_trajectory(f"Scheme {number}.", works, steps, rounds, C_ROW)
+        table, times = race_runs_of_one_trajectory(f"Scheme {number}.", works, steps, rounds, C_ROW)
         tables.append(table)
         targets.append(
             Target(
@@ -96,5 +96,5 @@ def max_difference_from_c(number: int) -> float:
     RuntimeError
         As for :func:`..contest.require_same_scheme`.
     """
-    ours, (theirs, _) = library_run(number, 1000, 1)().x[1:], c_program(number).integrate(X0, STEP, 1000, 1)
-    return require_same_scheme(float(np.abs(ours - theirs).max()), 1000)
+    library_states, (c_states, _) = library_run(number, 1000, 1)().x[1:], c_program(number).integrate(X0, STEP, 1000, 1)
+    return require_same_scheme(float(np.abs(library_states - c_states).max()), 1000)

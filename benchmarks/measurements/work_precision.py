@@ -162,7 +162,7 @@ def _c_builder(steps):
     def build():
         program = BodyProgram("rigid_body.c", body_parameters(RATE))
         end = lambda: program.integrate(X0, T_END / steps, steps)  # noqa: E731
-        return end, lambda found: (found[0][-1], laws.c_run_laws(found[1]))
+        return end, lambda result: (result[0][-1], laws.c_run_laws(result[1]))
 
     return build
 

@@ -201,7 +201,7 @@ class ExplicitMethod(TransportingMethod):
         """Raise InputError unless the system has a law to hold and conserves the functions that are to be preserved."""
         if not self._laws_to_hold(system):
             raise InputError(
-                f"{self} needs a system with an energy or entropy law, and this one has none. Use lt.Reference"
+                f"{self} needs a system with an energy or entropy law, but this one has none. Use lt.Reference"
             )
         check_preserved(system, self.functions)
 

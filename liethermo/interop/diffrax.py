@@ -25,7 +25,7 @@ __dir__ = public_dir(__all__)
 
 
 class Term(diffrax.ODETerm):
-    """The vector field of a system as a term of diffrax, for its solvers and for :class:`Solver`.
+    """The vector field of a system as a diffrax term, for the solvers of diffrax and for :class:`Solver`.
 
     Parameters
     ----------
@@ -37,14 +37,14 @@ class Term(diffrax.ODETerm):
 
     def __init__(self, system: System):
         self.system = system
-        self.vector_field = _unbound_field
+        self.vector_field = _raise_unbound_field
 
     def vf(self, t, y, args):
         """Return the vector field at a state, shape (n,)."""
         return self.system.vector_field(y, t if self.system.is_driven else None)
 
 
-def _unbound_field(t, y, args):
+def _raise_unbound_field(t, y, args):
     raise NotImplementedError("Term.vf knows the system")
 
 
@@ -69,7 +69,7 @@ class Solver(diffrax.AbstractAdaptiveSolver):
         self.method = DEFAULT_METHOD if method is None else method
 
     def order(self, terms) -> int:
-        """Return the order of the method."""
+        """Return the order of accuracy of the method."""
         return self.method.order
 
     def error_order(self, terms) -> int:
@@ -101,7 +101,7 @@ class Solver(diffrax.AbstractAdaptiveSolver):
         return y1, estimate, dense, tuple(state), result
 
     def func(self, terms, t0, y0, args):
-        """Return the vector field."""
+        """Return the vector field of the terms at a state, shape (n,)."""
         return terms.vf(t0, y0, args)
 
     def _system_and_method(self, terms) -> tuple[System, OneStepMethod]:

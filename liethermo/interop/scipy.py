@@ -133,28 +133,28 @@ def solve_ivp(
             "the methods take it from the system" if name in UNSUPPORTED_OPTIONS else "solve_ivp has no such option"
         )
         raise InputError(f"leave out {name}: {reason}")
-    functions = [] if events is None else [events] if callable(events) else list(events)
-    if args is not None and not functions:
+    event_functions = [] if events is None else [events] if callable(events) else list(events)
+    if args is not None and not event_functions:
         raise InputError("args are passed to the events, but there are none. A system contains its parameters")
-    start, end = _checked_span(t_span)
-    saved_times = None if t_eval is None else _checked_times(t_eval, start, end)
+    start, end = _checked_t_span(t_span)
+    saved_times = None if t_eval is None else _checked_t_eval(t_eval, start, end)
     _check_first_step(first_step, end - start)
-    arguments = _checked_args(args)
-    is_terminal = any(event_terminal(function) for function in functions)
+    arguments = _checked_event_args(args)
+    is_terminal = any(event_terminal(function) for function in event_functions)
     if math.isinf(end) and not is_terminal:
         raise InputError("an infinite end needs an event that ends the run. Set event.terminal = True, or a finite end")
     method = MetriplecticRungeKutta(order=8) if method is None else method
     step = Adaptive(
-        _scalar_tolerance("rtol", rtol, y0),
-        _scalar_tolerance("atol", atol, y0),
+        _smallest_tolerance("rtol", rtol, y0),
+        _smallest_tolerance("atol", atol, y0),
         first_step,
         None if max_step == math.inf else max_step,
     )
-    initial_zeros = [
-        _is_initial_event(function, arguments, fun, (start, end), y0, step, method) for function in functions
+    has_initial_event = [
+        _has_event_at_start(function, arguments, fun, (start, end), y0, step, method) for function in event_functions
     ]
-    if end == start or any(map(_ends_at_start, functions, initial_zeros)):
-        return _empty_span_result(fun, y0, start, method, saved_times, dense_output, functions, initial_zeros)
+    if end == start or any(map(_is_terminal_at_start, event_functions, has_initial_event)):
+        return _empty_span_result(fun, y0, start, method, saved_times, dense_output, event_functions, has_initial_event)
     solution = integrate(
         fun,
         y0,
@@ -162,21 +162,27 @@ def solve_ivp(
         step,
         method,
         save_at=None if saved_times is None else [start, *saved_times, *([end] if math.isfinite(end) else [])],
-        until=EventSpecification(functions, arguments, initial_zeros) if functions else None,
+        until=EventSpecification(event_functions, arguments, has_initial_event) if event_functions else None,
         dense=dense_output,
         on_failure="return",
         progress=False,
     )
     is_saved = np.ones(len(solution.t), bool) if saved_times is None else np.isin(solution.t, saved_times)
-    return _ode_result(solution, solution.t[is_saved], solution.x[is_saved], method, initial_zeros, dense_output)
+    return _to_ode_result(solution, solution.t[is_saved], solution.x[is_saved], method, has_initial_event, dense_output)
 
 
-def _ode_result(
-    solution: Solution, t: np.ndarray, x: np.ndarray, method: OneStepMethod, initial_zeros: list[bool], dense: bool
+def _to_ode_result(
+    solution: Solution,
+    saved_times: np.ndarray,
+    saved_states: np.ndarray,
+    method: OneStepMethod,
+    has_initial_event: list[bool],
+    has_dense_output: bool,
 ) -> OdeResult:
-    """Return a solution in SciPy's form, with the requested states x, shape (times, n).
+    """Convert a solution to SciPy's result, with the states at the requested times, shape (times, n).
 
-    ``initial_zeros`` says of each event function whether it has an event at the start, which the run does not look for.
+    ``has_initial_event`` is True for each event function with an event at the start, where the run does not look for
+    events.
     """
     stats, status = solution.stats, SCIPY_STATUS.get(str(solution.status.code), -1)
     iterations = stats.fixed_point_iterations + stats.newton_iterations
@@ -184,17 +190,17 @@ def _ode_result(
     def sol(t):
         return np.moveaxis(solution(t), -1, 0)
 
-    events = solution.events or [None] * len(initial_zeros)
+    events = solution.events or [None] * len(has_initial_event)
     no_events = np.empty(0), np.empty((0, *solution.x.shape[1:]))
     t_events, y_events = [], []
-    for is_zero, series in zip(initial_zeros, events, strict=True):
+    for has_event, series in zip(has_initial_event, events, strict=True):
         times, states = no_events if series is None else (series.t, series.x)
-        t_events.append(np.append(solution.t[: int(is_zero)], times))
-        y_events.append(np.append(solution.x[: int(is_zero)], states, axis=0))
+        t_events.append(np.append(solution.t[: int(has_event)], times))
+        y_events.append(np.append(solution.x[: int(has_event)], states, axis=0))
     return OdeResult(
-        t=t,
-        y=x.T,
-        sol=sol if dense else None,
+        t=saved_times,
+        y=saved_states.T,
+        sol=sol if has_dense_output else None,
         t_events=t_events or None,
         y_events=y_events or None,
         nfev=iterations * method.evaluations_per_iteration,
@@ -211,55 +217,59 @@ FIRST_STRETCH = 1e-4
 """Part of the span after which the sign of an event function that is zero at the start is evaluated."""
 
 
-def _is_initial_event(
-    function: Callable,
+def _has_event_at_start(
+    event_function: Callable,
     arguments: tuple,
-    fun: System,
+    system: System,
     span: tuple[float, float],
-    y0,
+    x0,
     step: Adaptive,
     method: OneStepMethod,
 ) -> bool:
-    """Return whether an event function has an event at the start of a run: it is zero, and leaves in its direction."""
-    (start, end), x = span, np.asarray(fun.state(y0)).reshape(np.shape(y0))
-    direction = event_direction(function)
-    if float(function(start, x, *arguments)) != 0.0:
+    """Return True if an event function has an event at the start of a run: it is zero and then changes in its
+    direction."""
+    (start, end), x = span, np.asarray(system.state(x0)).reshape(np.shape(x0))
+    direction = event_direction(event_function)
+    if float(event_function(start, x, *arguments)) != 0.0:
         return False
     if direction == 0 or end == start:
         return True
-    longest = FIRST_STRETCH * (end - start) if math.isfinite(end) else 1.0
-    length = min(longest, step.first or math.inf, step.largest or math.inf)
-    stretch = integrate(fun, y0, (start, start + length), step, method, on_failure="return", progress=False)
-    return direction * float(function(stretch.t[-1], stretch.x[-1], *arguments)) >= 0.0
+    max_length = FIRST_STRETCH * (end - start) if math.isfinite(end) else 1.0
+    length = min(max_length, step.first or math.inf, step.largest or math.inf)
+    short_run = integrate(system, x0, (start, start + length), step, method, on_failure="return", progress=False)
+    return direction * float(event_function(short_run.t[-1], short_run.x[-1], *arguments)) >= 0.0
 
 
-def _ends_at_start(function: Callable, is_zero: bool) -> bool:
-    return is_zero and event_terminal(function) == 1
+def _is_terminal_at_start(event_function: Callable, has_initial_event: bool) -> bool:
+    """Return True if an event at the start of a run ends it."""
+    return has_initial_event and event_terminal(event_function) == 1
 
 
 def _empty_span_result(
-    fun: System,
-    y0,
+    system: System,
+    x0,
     t: float,
     method: OneStepMethod,
     saved_times: np.ndarray | None,
-    dense: bool,
-    functions: list[Callable],
-    initial_zeros: list[bool],
+    has_dense_output: bool,
+    event_functions: list[Callable],
+    has_initial_event: list[bool],
 ) -> OdeResult:
-    """Return the result of a run without steps: as in SciPy, the initial state at its start and at its end."""
-    solution = solution_without_steps(fun, y0, t, method)
+    """Return the result of a run without steps: as in SciPy, the initial state at the start and at the end."""
+    solution = solution_without_steps(system, x0, t, method)
     times = np.array([t, t]) if saved_times is None else saved_times[saved_times <= t]
-    result = _ode_result(solution, times, np.repeat(solution.x, len(times), axis=0), method, initial_zeros, dense)
-    is_terminated = any(map(_ends_at_start, functions, initial_zeros))
+    result = _to_ode_result(
+        solution, times, np.repeat(solution.x, len(times), axis=0), method, has_initial_event, has_dense_output
+    )
+    is_terminated = any(map(_is_terminal_at_start, event_functions, has_initial_event))
     return replace(result, status=1, message="A termination event occurred.") if is_terminated else result
 
 
-def _check_first_step(first_step: float | None, length: float) -> None:
-    if first_step is not None and not 0.0 < first_step <= length:
+def _check_first_step(first_step: float | None, span_length: float) -> None:
+    if first_step is not None and not 0.0 < first_step <= span_length:
         raise InputError(
-            f"first_step must be positive and at most the length of t_span, {length:g}, got {first_step:g}. Leave it "
-            "out, and it is chosen"
+            f"first_step must be positive and at most the length of t_span, {span_length:g}, got {first_step:g}. "
+            "Leave it out, and it is chosen"
         )
 
 
@@ -267,20 +277,20 @@ MIN_RTOL = 100.0 * float(np.finfo(np.float64).eps)
 """Minimum relative tolerance in an array, as in SciPy; smaller values are raised to it."""
 
 
-def _scalar_tolerance(name: str, tolerance, y0) -> float:
-    """Return a tolerance for all components: the smallest entry of an array."""
+def _smallest_tolerance(name: str, tolerance, x0) -> float:
+    """Return the smallest entry of a tolerance, a number or an array of shape (n,), to be used for all components."""
     if np.ndim(tolerance) == 0:
         return tolerance.item() if isinstance(tolerance, np.ndarray) else tolerance
     values = np.asarray(tolerance, dtype=np.float64)
-    if values.shape != np.shape(y0):
-        raise InputError(f"{name} must be a number or an array of shape {np.shape(y0)}, as y0, got {values.shape}")
+    if values.shape != np.shape(x0):
+        raise InputError(f"{name} must be a number or an array of shape {np.shape(x0)}, as y0, got {values.shape}")
     if name == "rtol" and (values < MIN_RTOL).any():
         warn(f"At least one element of rtol is too small. Setting rtol = np.maximum(rtol, {MIN_RTOL:.3g})")
         values = np.maximum(values, MIN_RTOL)
     return float(values.min())
 
 
-def _checked_span(t_span) -> tuple[float, float]:
+def _checked_t_span(t_span) -> tuple[float, float]:
     try:
         start, end = map(float, t_span)
     except (TypeError, ValueError):
@@ -292,14 +302,14 @@ def _checked_span(t_span) -> tuple[float, float]:
     return start, end
 
 
-def _checked_times(t_eval, start: float, end: float) -> np.ndarray:
+def _checked_t_eval(t_eval, start: float, end: float) -> np.ndarray:
     times = np.asarray(t_eval, dtype=np.float64)
     if times.ndim != 1 or np.any(np.diff(times) <= 0.0):
         raise InputError("t_eval must be a list of increasing times")
     return clip_times_to_span(times, start, end, "t_eval")
 
 
-def _checked_args(args) -> tuple:
+def _checked_event_args(args) -> tuple:
     if args is None:
         return ()
     try:

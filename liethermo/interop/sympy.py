@@ -121,7 +121,7 @@ def expressions(system: System, names: Sequence[str] | None = None) -> Expressio
 
     def to_expressions(function: Callable) -> list[sympy.Expr]:
         jaxpr = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((system.dim,), jnp.float64))
-        return _program_expressions(scalarize(jaxpr), variables)
+        return _expressions_of_program(scalarize(jaxpr), variables)
 
     return Expressions(
         variables=variables,
@@ -133,7 +133,7 @@ def expressions(system: System, names: Sequence[str] | None = None) -> Expressio
 
 
 def function(expression: Any, variables: Sequence[sympy.Symbol]) -> Callable:
-    """Return a SymPy expression as a function of the state, for the energy or the entropy of a system.
+    """Convert a SymPy expression to a function of the state, for the energy or the entropy of a system.
 
     Parameters
     ----------
@@ -157,13 +157,13 @@ def function(expression: Any, variables: Sequence[sympy.Symbol]) -> Callable:
         )
     if expression.is_polynomial(*variables):
         return mf.sympy.polynomial(expression, variables)
-    jax_function = _jax_function(expression, variables)
+    jax_function = _lambdify_for_jax(expression, variables)
     if jax_function is None:
         subexpressions = sympy.postorder_traversal(expression)
         unknown = next(
             subexpression
             for subexpression in subexpressions
-            if subexpression.args and _jax_function(subexpression, variables) is None
+            if subexpression.args and _lambdify_for_jax(subexpression, variables) is None
         )
         raise InputError(
             f"{unknown.func.__name__} in {unknown} has no counterpart in JAX. Write the function with jax.numpy"
@@ -171,8 +171,8 @@ def function(expression: Any, variables: Sequence[sympy.Symbol]) -> Callable:
     return jax_function
 
 
-def _jax_function(expression: sympy.Basic, variables: tuple[sympy.Symbol, ...]) -> Callable | None:
-    """Return the expression as a function of one JAX array, or None if JAX lacks one of its functions."""
+def _lambdify_for_jax(expression: sympy.Basic, variables: tuple[sympy.Symbol, ...]) -> Callable | None:
+    """Convert a SymPy expression to a function of one JAX array; return None if JAX lacks a function in it."""
     try:
         numeric_function = sympy.lambdify(variables, expression, modules=[JAX_SPECIAL_FUNCTIONS, "jax"])
         jax.eval_shape(lambda x: numeric_function(*x), jax.ShapeDtypeStruct((len(variables),), jnp.float64))
@@ -211,10 +211,10 @@ def describe(system: System, x0, t_span: tuple[float, float], name: str = "probl
         "format": PROBLEM_FORMAT,
         "name": name,
         "variables": [str(x) for x in symbolic.variables],
-        "energy": _source_texts(symbolic.energy),
-        "entropy": None if symbolic.entropy is None else _source_texts(symbolic.entropy),
-        "casimirs": {key: _source_texts(value) for key, value in symbolic.casimirs.items()},
-        "field": [_source_texts(component) for component in symbolic.field],
+        "energy": _sympy_and_julia_code(symbolic.energy),
+        "entropy": None if symbolic.entropy is None else _sympy_and_julia_code(symbolic.entropy),
+        "casimirs": {key: _sympy_and_julia_code(value) for key, value in symbolic.casimirs.items()},
+        "field": [_sympy_and_julia_code(component) for component in symbolic.field],
         "initial_state": [float(value) for value in np.asarray(x0, dtype=np.float64)],
         "t_span": [float(t) for t in t_span],
         "reference": _reference_solution(system, x0, t_span),
@@ -247,12 +247,14 @@ def write(problem: dict[str, Any], path: str | os.PathLike) -> Path:
     return path
 
 
-def _source_texts(expression: sympy.Expr) -> dict[str, str]:
+def _sympy_and_julia_code(expression: sympy.Expr) -> dict[str, str]:
+    """Return the source text of an expression in SymPy and in Julia, by language."""
     return {"sympy": str(expression), "julia": sympy.julia_code(expression)}
 
 
 def _reference_solution(system: System, x0, t_span: tuple[float, float]) -> dict[str, Any]:
-    """Return the final state, rounded to the digits in which two methods agree, and their largest difference."""
+    """Integrate with two methods; return the final state, rounded to the digits in which they agree, and the
+    difference."""
     duration = t_span[1] - t_span[0]
     x_dop853 = integrate(system, x0, t_span, duration, Reference(rtol=1e-13), progress=False).x[-1]
     x_gauss = integrate(
@@ -264,28 +266,32 @@ def _reference_solution(system: System, x0, t_span: tuple[float, float]) -> dict
 
 
 def _accurate_step_size(system: System, x0, duration: float) -> float:
-    """Return a step for collocation of order 12: a fifth of the time in which the state changes by its own
+    """Return a step size for 6-stage Gauss collocation: a fifth of the time in which the state changes by its
     magnitude."""
     x = np.asarray(x0, dtype=np.float64)
     max_rate = float(np.abs(system.vector_field(system.state(x))).max())
     return float(min(0.05 * duration, 0.2 * max(np.abs(x).max(), 1e-3) / max(max_rate, 1e-300), 0.1))
 
 
-def _program_expressions(program: Program, variables: Sequence[sympy.Symbol]) -> list[sympy.Expr]:
-    """Return the outputs of a traced program as expressions of the variables, its only input."""
+def _expressions_of_program(program: Program, variables: Sequence[sympy.Symbol]) -> list[sympy.Expr]:
+    """Return the outputs of a traced program with one input as SymPy expressions of the variables."""
     values: dict[Any, Any] = dict(zip(program.inputs[0], variables, strict=True))
 
-    def value(a: Any) -> Any:
-        return values[a] if isinstance(a, str) else _to_sympy_number(a)
+    def expression_of(operand: Any) -> Any:
+        return values[operand] if isinstance(operand, str) else _to_sympy_constant(operand)
 
     for target, op, args in program.instructions:
         if op == "float":
-            values[target] = value(args[0])
+            values[target] = expression_of(args[0])
         elif isinstance(op, str) and op in SYMPY_OPERATIONS:
-            values[target] = SYMPY_OPERATIONS[op](*map(value, args))
+            values[target] = SYMPY_OPERATIONS[op](*map(expression_of, args))
         else:
             raise InputError(f"the operation {str(op)!r} has no SymPy expression")
-    return [sympy.expand(value(a)) if _is_short(value(a)) else value(a) for entries in program.outputs for a in entries]
+    return [
+        sympy.expand(expression_of(operand)) if _is_short(expression_of(operand)) else expression_of(operand)
+        for entries in program.outputs
+        for operand in entries
+    ]
 
 
 def _is_short(expression: Any) -> bool:
@@ -293,7 +299,7 @@ def _is_short(expression: Any) -> bool:
     return sympy.count_ops(expression) < 400
 
 
-def _to_sympy_number(value: Any) -> Any:
+def _to_sympy_constant(value: Any) -> Any:
     if isinstance(value, bool | np.bool_):
         return sympy.true if value else sympy.false
     number = float(value)

@@ -224,7 +224,7 @@ def fit(
         starts = [states_from_observations(observation, prepared_system, x) for x, _ in smoothed_trajectories]
     else:
         times_and_smoothed = [
-            (t, *smoothed) for (t, _), smoothed in zip(trajectories, smoothed_trajectories, strict=True)
+            (t, *states_and_rates) for (t, _), states_and_rates in zip(trajectories, smoothed_trajectories, strict=True)
         ]
         starts = states_matching_observations_and_rates(
             observation, prepared_system, times_and_smoothed, data_scale.scale, data_scale.time_scale, values
@@ -417,7 +417,7 @@ def _build_fitted_system(params: losses.ParameterVector, weights: np.ndarray, tr
         If there is no system with the fitted parameters, such as one with a negative friction.
     """
     try:
-        fitted = params.build_system(jnp.asarray(weights))
+        fitted_system = params.build_system(jnp.asarray(weights))
     except (LiethermoError, ManifoldsError) as error:
         values = np.where(params.is_log, np.exp(weights), weights)
         text = ", ".join(f"{name} = {value:.3g}" for name, value in zip(params.names, values, strict=True))
@@ -425,10 +425,10 @@ def _build_fitted_system(params: losses.ParameterVector, weights: np.ndarray, tr
             f"the least squares end at {text}, with which no system can be built: {error}. Keep such parameters "
             "positive with positive=, or begin with other initial values"
         ) from error
-    object.__setattr__(fitted, "training", training)
+    object.__setattr__(fitted_system, "training", training)
     for problem in training.problems:
         warn(problem, FitWarning)
-    return fitted
+    return fitted_system
 
 
 def _fitted_initial_states(
@@ -509,11 +509,11 @@ def _split_off_held_out_data(data: list, held_out_fraction: float, seed: int) ->
         return data, []
     if len(data) == 1:
         (t, x), states = data[0]
-        cut = round((1.0 - held_out_fraction) * (len(t) - 1))
-        if min(cut, len(t) - 1 - cut) < 1:
+        split_index = round((1.0 - held_out_fraction) * (len(t) - 1))
+        if min(split_index, len(t) - 1 - split_index) < 1:
             return data, []
-        training_part = Trajectory(t[: cut + 1], x[: cut + 1]), states[: cut + 1]
-        return [training_part], [(Trajectory(t[cut:], x[cut:]), states[cut:])]
+        training_part = Trajectory(t[: split_index + 1], x[: split_index + 1]), states[: split_index + 1]
+        return [training_part], [(Trajectory(t[split_index:], x[split_index:]), states[split_index:])]
     order = np.random.default_rng(seed).permutation(len(data))
     count = min(max(1, round(held_out_fraction * len(data))), len(data) - 1)
     return [data[i] for i in sorted(order[count:])], [data[i] for i in sorted(order[:count])]

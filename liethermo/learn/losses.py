@@ -60,8 +60,10 @@ def parameter_vector(system: System, also: Callable | None = None, positive: Cal
     for choose in (also, positive):
         if choose is not None:
             mask = eqx.tree_at(choose, mask, replace_fn=lambda part: jax.tree_util.tree_map(lambda _: True, part))
-    no_mask = jax.tree_util.tree_map(lambda _: False, mask)
-    positive_mask = no_mask if positive is None else eqx.tree_at(positive, no_mask, replace_fn=lambda _: True)
+    all_false_mask = jax.tree_util.tree_map(lambda _: False, mask)
+    positive_mask = (
+        all_false_mask if positive is None else eqx.tree_at(positive, all_false_mask, replace_fn=lambda _: True)
+    )
     learned_part, fixed_part = eqx.partition(system, mask)
     logs, values = eqx.partition(learned_part, positive_mask)
     logs_and_values = jax.tree_util.tree_map(jnp.log, logs), values
@@ -249,8 +251,8 @@ def differentiable_stepper(
             "fit do not end. Use functions of time that are continuous"
         )
     prepared_system, method = prepare_for_method(system, method, None, has_attitude)
-    inner = method.method if isinstance(method, WithAttitude) else method
-    needs_no_compensation = isinstance(inner, MetriplecticRungeKutta) and prepared_system.surface is None
+    base_method = method.method if isinstance(method, WithAttitude) else method
+    needs_no_compensation = isinstance(base_method, MetriplecticRungeKutta) and prepared_system.surface is None
 
     def step(carry, h):
         if needs_no_compensation:

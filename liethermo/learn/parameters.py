@@ -34,7 +34,7 @@ def initial_parameter_values(system: System | Callable, parameters: Any) -> dict
         If names or values cannot be used.
     """
     if isinstance(system, System) and not isinstance(parameters, Mapping):
-        names = _as_name_list(parameters)
+        names = _to_name_list(parameters)
         if names is None:
             raise InputError(f"parameters must be names, or a dict from names to initial values, got {parameters!r}")
         parameters = {name: find_parameter(system, name).value for name in names}
@@ -122,7 +122,7 @@ def _names_of_positive_parameters(positive: Any, names: list[str]) -> tuple[str,
     """Return the names of the parameters that stay positive; raise InputError if one is unknown."""
     if positive is None or isinstance(positive, bool):
         return tuple(names) if positive else ()
-    name_list = _as_name_list(positive)
+    name_list = _to_name_list(positive)
     if name_list is None:
         raise InputError(f"positive must be True, or names of parameters, if parameters= is given; got {positive!r}")
     if unknown := [name for name in name_list if name not in names]:
@@ -130,7 +130,7 @@ def _names_of_positive_parameters(positive: Any, names: list[str]) -> tuple[str,
     return tuple(name_list)
 
 
-def _as_name_list(names: Any) -> list[str] | None:
+def _to_name_list(names: Any) -> list[str] | None:
     """Return one name, or several, as a list; None if a value is not a text."""
     name_list = [names] if isinstance(names, str) else list(names) if isinstance(names, Iterable) else [names]
     return name_list if all(isinstance(name, str) for name in name_list) else None

@@ -468,7 +468,7 @@ def scale_networks(system: T, scales: DataScales, points: np.ndarray) -> T:
     def map_leaves(leaf_class, tree, change):
         return jax.tree_util.tree_map(change, tree, is_leaf=lambda part: isinstance(part, leaf_class))
 
-    parts: dict[str, Any] = {
+    scaled_fields: dict[str, Any] = {
         "energy": _fill_network_scales(system.energy, x, energy),
         "entropy": _fill_network_scales(system.entropy, x, entropy),
         "dissipation": map_leaves(Friction, system.dissipation, scale_friction),
@@ -476,11 +476,11 @@ def scale_networks(system: T, scales: DataScales, points: np.ndarray) -> T:
     if isinstance(poisson, Poisson):
         scaled_function = _fill_network_scales(poisson.function, x, pairs / (energy * tau))
         poisson = eqx.tree_at(lambda p: (p.function, p.metric), poisson, (scaled_function, s**2))
-    parts["poisson"] = poisson
-    names = list(parts)
-    present_names = [name for name in names if parts[name] is not None]
+    scaled_fields["poisson"] = poisson
+    names = list(scaled_fields)
+    present_names = [name for name in names if scaled_fields[name] is not None]
     scaled_system = eqx.tree_at(
-        lambda m: [getattr(m, name) for name in present_names], system, [parts[name] for name in present_names]
+        lambda m: [getattr(m, name) for name in present_names], system, [scaled_fields[name] for name in present_names]
     )
     return copy_entropy_to_poisson(scaled_system)
 

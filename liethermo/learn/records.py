@@ -65,8 +65,8 @@ class Records(Sequence[Trajectory], metaclass=ListedABCMeta):
     def __str__(self) -> str:
         n_rows = sum(len(t) for t, _ in self.trajectories)
         start, end = min(t[0] for t, _ in self.trajectories), max(t[-1] for t, _ in self.trajectories)
-        missing = sum(int(np.isnan(x).sum()) for _, x in self.trajectories)
-        missing_text = f", {missing} values missing" if missing else ""
+        n_missing = sum(int(np.isnan(x).sum()) for _, x in self.trajectories)
+        missing_text = f", {n_missing} values missing" if n_missing else ""
         plural = "y" if len(self) == 1 else "ies"
         return (
             f"{', '.join(self.names)}: {n_rows} rows in {len(self)} trajector{plural}, times {start:.4g} to {end:.4g}"
@@ -79,7 +79,7 @@ class Records(Sequence[Trajectory], metaclass=ListedABCMeta):
         Raises
         ------
         InputError
-            If there is no column of a name.
+            If there is no column of this name.
         """
         for name in names:
             if name not in self.names:
@@ -219,7 +219,10 @@ class _Labels:
             problem = (
                 f"the columns {', '.join(matches)} may all be times" if matches else "the data have no column 'time'"
             )
-            raise InputError(f"{problem}; their columns are {', '.join(self.names)}. Name the times with time=")
+            raise InputError(
+                f"{problem}; their columns are {', '.join(self.names)}. Name the column of the times, such as "
+                f"lt.learn.read_data(data, time={(matches or list(self.names))[0]!r})"
+            )
         return matches[0]
 
     def unit_text(self, label: str) -> str:
@@ -392,10 +395,10 @@ def _read_csv(path: Path):
         with path.open(encoding="utf-8-sig") as file:
             header = next((line for line in file if line.strip() and not line.startswith("#")), "")
         separator = max(SEPARATORS, key=header.count)
-        how = {"sep": separator, "comment": "#", "skipinitialspace": True, "encoding": "utf-8-sig"}
-        frame = pandas.read_csv(path, **how)
+        read_options = {"sep": separator, "comment": "#", "skipinitialspace": True, "encoding": "utf-8-sig"}
+        frame = pandas.read_csv(path, **read_options)
         if separator != "," and any(map(pandas.api.types.is_string_dtype, frame.dtypes)):  # 1,5 in place of 1.5
-            frame = pandas.read_csv(path, decimal=",", **how)
+            frame = pandas.read_csv(path, decimal=",", **read_options)
     except FileNotFoundError:
         raise FileError(f"there is no file {path!s:.200}") from None
     except (OSError, UnicodeDecodeError, ValueError) as error:  # errors of the parser of pandas are ValueErrors

@@ -159,8 +159,8 @@ def can_refine_by_least_squares(
     )
 
 
-def _is_perceptron(part: Any) -> bool:
-    return isinstance(part, Perceptron)
+def _is_perceptron(node: Any) -> bool:
+    return isinstance(node, Perceptron)
 
 
 def pad_runs(trajectories: list[Trajectory], states: list[np.ndarray]) -> PaddedRuns:
@@ -250,11 +250,11 @@ class RunModel:
         p = weights.size
 
         def value_and_derivative(arrays):
-            def predict_from(v):
-                predictions = self._predictions_of_run(weights + v[:p], v[p:], substeps, *arrays)
+            def predict_at_displacement(displacement):
+                predictions = self._predictions_of_run(weights + displacement[:p], displacement[p:], substeps, *arrays)
                 return predictions, predictions
 
-            derivative, value = jax.jacfwd(predict_from, has_aux=True)(jnp.zeros(p + self.n_coordinates))
+            derivative, value = jax.jacfwd(predict_at_displacement, has_aux=True)(jnp.zeros(p + self.n_coordinates))
             return value, derivative
 
         return jax.lax.map(value_and_derivative, arrays, batch_size=min(len(arrays[0]), 16))
@@ -353,7 +353,7 @@ def refine_by_least_squares(
     equations = evaluate(weights, states)
     if not equations.is_finite[is_training].all():
         return _failed_result(weights, runs)
-    damping, converged, iterations = INITIAL_DAMPING, False, 0
+    damping, is_converged, iterations = INITIAL_DAMPING, False, 0
     degrees_of_freedom = _degrees_of_freedom(
         n_observations, equations.matrices[:, n_weights:, n_weights:], is_training, n_weights
     )
@@ -364,9 +364,9 @@ def refine_by_least_squares(
         schur, _ = _schur_complement(matrices_with_prior, equations.gradients, n_weights, is_training)
         newton = _gauss_newton_step(matrices_with_prior, equations.gradients, n_weights, is_training, 0.0)
         newton_step_norm = np.sqrt(max(newton @ schur @ newton, 0.0) / variance) if variance > 0.0 else 0.0
-        converged = bool(newton_step_norm <= tolerance or variance <= exact_variance)
+        is_converged = bool(newton_step_norm <= tolerance or variance <= exact_variance)
         vanishes = (initial_weights - weights)[is_log].max(initial=0.0) > MAX_LOG_DECREASE
-        if (converged and iterations > 0) or vanishes:
+        if (is_converged and iterations > 0) or vanishes:
             break
         iterations += 1
         step = _gauss_newton_step(matrices_with_prior, equations.gradients, n_weights, is_training, damping)
@@ -384,7 +384,7 @@ def refine_by_least_squares(
             weights, states, equations = new_weights, new_states, new_equations
             variance = new_costs[is_training].sum() / max(degrees_of_freedom, 1)
             damping *= DAMPING_DECREASE
-        elif converged:  # nothing but rounding is left
+        elif is_converged:  # nothing but rounding is left
             break
         else:
             damping *= DAMPING_INCREASE
@@ -392,20 +392,20 @@ def refine_by_least_squares(
     schur, slope = _schur_complement(
         _add_initial_state_prior(matrices, n_weights, variance), gradients, n_weights, is_training
     )
-    total = costs[is_training].sum()
-    variance = total / degrees_of_freedom if degrees_of_freedom > 0 else np.nan
+    total_cost = costs[is_training].sum()
+    variance = total_cost / degrees_of_freedom if degrees_of_freedom > 0 else np.nan
     inverse, _, condition = _inverse_rank_and_condition(schur)
     weight_diagonal = np.diag(matrices[is_training].sum(axis=0))[:n_weights]  # with the first states known
-    without_prior, rank, _ = _inverse_rank_and_condition(
+    inverse_without_prior, rank, _ = _inverse_rank_and_condition(
         _schur_complement(matrices, gradients, n_weights, is_training)[0], weight_diagonal
     )
     if rank < n_weights:  # the prior alone determines the rest
-        inverse, condition = np.where(np.isinf(without_prior), np.inf, inverse), np.inf
+        inverse, condition = np.where(np.isinf(inverse_without_prior), np.inf, inverse), np.inf
     held_out_residual = np.nan
     if not is_training.all() and equations.is_finite[~is_training].all():
         held_out_freedom = _degrees_of_freedom(n_observations, matrices[:, n_weights:, n_weights:], ~is_training, 0)
         held_out_residual = np.sqrt(costs[~is_training].sum() / held_out_freedom) if held_out_freedom > 0 else np.nan
-    gradient = 2.0 * float(np.linalg.norm(slope)) / total if total > 0.0 else 0.0
+    gradient = 2.0 * float(np.linalg.norm(slope)) / total_cost if total_cost > 0.0 else 0.0
     with np.errstate(invalid="ignore"):
         covariance = inverse * variance
     is_training_run = ~np.asarray(is_held_out)
@@ -417,7 +417,7 @@ def refine_by_least_squares(
         float(np.sqrt(variance)),
         float(held_out_residual),
         gradient,
-        converged,
+        is_converged,
         iterations,
         degrees_of_freedom,
         states,
@@ -461,8 +461,8 @@ def _pseudo_inverse(normal_matrix: np.ndarray, damping: float = 0.0) -> np.ndarr
     """Return the pseudo-inverse of a scaled normal matrix with a damped diagonal."""
     diagonal = np.diag(normal_matrix)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    scaled = normal_matrix * np.outer(scale, scale) + damping * np.eye(len(normal_matrix))
-    return np.linalg.pinv(scaled, rcond=SCHUR_RTOL, hermitian=True) * np.outer(scale, scale)
+    scaled_matrix = normal_matrix * np.outer(scale, scale) + damping * np.eye(len(normal_matrix))
+    return np.linalg.pinv(scaled_matrix, rcond=SCHUR_RTOL, hermitian=True) * np.outer(scale, scale)
 
 
 def _schur_complement(
@@ -514,8 +514,8 @@ def _inverse_rank_and_condition(schur: np.ndarray, diagonal: np.ndarray | None =
     is_determined = values > SCHUR_RTOL
     rank = int(is_determined.sum())
     condition = float(np.sqrt(values[-1] / values[0])) if rank == len(values) else np.inf
-    scaled = vectors * scale[:, None]
-    inverse = (scaled[:, is_determined] / values[is_determined]) @ scaled[:, is_determined].T
+    scaled_vectors = vectors * scale[:, None]
+    inverse = (scaled_vectors[:, is_determined] / values[is_determined]) @ scaled_vectors[:, is_determined].T
     is_undetermined = (np.abs(vectors[:, ~is_determined]) > 1e-6).any(axis=1)
     inverse[is_undetermined], inverse[:, is_undetermined] = np.inf, np.inf
     return inverse, rank, condition

@@ -269,15 +269,15 @@ class Training(metaclass=ListedType):
                 "with other initial values, or give more iterations, as shooting=2000. If a positive parameter "
                 "tends to 0, leave it out of the fit"
             )
-        undetermined = [
+        undetermined_parameters = [
             f"{name} = {value:.3g} ± {error:.2g}"
             for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True)
             if np.isinf(error) or (value > 0.0 and error > MAX_RELATIVE_STANDARD_ERROR * value)
         ]
-        if undetermined:
+        if undetermined_parameters:
             messages.append(
-                f"the data do not determine {', '.join(undetermined)}. Give more data, or leave known numbers out of "
-                "the fit"
+                f"the data do not determine {', '.join(undetermined_parameters)}. Give more data, or leave "
+                "known numbers out of the fit"
             )
         max_residual = MAX_RESIDUAL_TO_NOISE
         if self.noise.size and self.noise_is_estimated:  # two standard errors above the noise that was estimated
@@ -342,8 +342,8 @@ class Training(metaclass=ListedType):
 
 def training_without_descent(n_parameters: int, seconds: float) -> Training:
     """Return an empty record, for a fit by least squares alone."""
-    no_values = np.zeros(0)
-    return Training(np.zeros(0, int), np.zeros(0, str), no_values, no_values, n_parameters, seconds)
+    empty_array = np.zeros(0)
+    return Training(np.zeros(0, int), np.zeros(0, str), empty_array, empty_array, n_parameters, seconds)
 
 
 class TrainingRun:
@@ -375,8 +375,8 @@ class TrainingRun:
         InputError
             If the loss is not finite.
         """
-        total = sum(phase.steps for phase in self.phases)
-        with Progress((0, total), progress, "step {:.0f}") as progress_bar:
+        n_steps = sum(phase.steps for phase in self.phases)
+        with Progress((0, n_steps), progress, "step {:.0f}") as progress_bar:
             while self.phase_index < len(self.phases):
                 phase = self.phases[self.phase_index]
                 try:
@@ -482,7 +482,7 @@ class TrainingRun:
         Raises
         ------
         FileError
-            If the file is no checkpoint, or of another fit.
+            If the file is not a checkpoint, or of another fit.
         """
         metadata, arrays = read_archive(path, CHECKPOINT_FORMAT)
         if metadata.get("identity") != self.fit_fingerprint:
@@ -593,15 +593,15 @@ def read_archive(path: Path, file_format: str) -> tuple[dict[str, Any], dict[str
 
 
 def _checksum(metadata: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:
-    parts = [
-        part for name in sorted(arrays) for part in (name, arrays[name].dtype.str, arrays[name].shape, arrays[name])
+    values = [
+        value for name in sorted(arrays) for value in (name, arrays[name].dtype.str, arrays[name].shape, arrays[name])
     ]
-    return fingerprint(json.dumps(metadata, sort_keys=True), *parts)
+    return fingerprint(json.dumps(metadata, sort_keys=True), *values)
 
 
 def fingerprint(*values: Any) -> str:
     """Return the SHA-256 of arrays and of the texts of other objects, as hexadecimal."""
     digest = hashlib.sha256()
-    for part in values:
-        digest.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
+    for value in values:
+        digest.update(np.ascontiguousarray(value).tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
     return digest.hexdigest()

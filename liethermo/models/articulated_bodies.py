@@ -22,11 +22,11 @@ from ..dissipation.base import Dissipation
 from ..dissipation.factor import Factor
 from ..functions.energy import Energy, Pullback, float64_array
 from ..functions.indices import Indices
-from ..tracing.programs import subprogram
+from ..tracing.programs import jit_subprogram
 
 
 class Poses(NamedTuple):
-    """Places of the links, joints and bodies of a tree, in axes of the base.
+    """Positions and orientations of the links, joints and bodies of a tree, in axes of the base.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Poses(NamedTuple):
 
 
 class SpatialInertias(NamedTuple):
-    """Inertias about the origin of the base, of which momenta are linear functions; an axis of them stands first.
+    """Spatial inertias of n bodies about the origin of the base, which map spatial velocities to momenta.
 
     Attributes
     ----------
@@ -68,12 +68,12 @@ class SpatialInertias(NamedTuple):
     def momentum(self, velocity) -> jax.Array:
         """Return the spatial momentum at a spatial velocity, both of shape (n, 6)."""
         omega, v = velocity[:, :3], velocity[:, 3:]
-        angular = _products(self.rotational, omega) + jnp.cross(self.first_moment, v)
+        angular = _matrix_vector_products(self.rotational, omega) + jnp.cross(self.first_moment, v)
         return jnp.concatenate([angular, self.mass[:, None] * v - jnp.cross(self.first_moment, omega)], axis=1)
 
 
 class Motion(NamedTuple):
-    """Velocities of a tree for given momenta, with the forces of the kinetic energy.
+    """Velocities of a tree at given momenta, with the derivative of the kinetic energy by the joint coordinates.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Motion(NamedTuple):
 
 
 class ArticulatedBodies(Module):
-    """A tree of rigid bodies: link 0 is the base, and joint i moves link i + 1 against its parent.
+    """The mechanics of a tree of rigid bodies: link 0 is the base, and joint i moves link i + 1 against its parent.
 
     A link without a body stands between two joints that act at one place. The axes of all links are parallel if all
     joint coordinates are zero.
@@ -147,16 +147,16 @@ class ArticulatedBodies(Module):
 
     @property
     def _path_matrix(self) -> np.ndarray:
-        """Truth of "joint j is on the path from the base to link i", shape (k + 1, k)."""
-        moved_by = np.zeros((self.n_joints + 1, self.n_joints), bool)
+        """Boolean matrix, shape (k + 1, k), that is True if joint j is on the path from the base to link i."""
+        is_on_path = np.zeros((self.n_joints + 1, self.n_joints), bool)
         for i, parent in enumerate(self.parents):
-            moved_by[i + 1] = moved_by[parent]
-            moved_by[i + 1, i] = True
-        return moved_by
+            is_on_path[i + 1] = is_on_path[parent]
+            is_on_path[i + 1, i] = True
+        return is_on_path
 
     @property
-    def _bodies_beyond(self) -> np.ndarray:
-        """Matrix that sums over the bodies that move with each link, shape (k + 1, m); those of the base are all."""
+    def _bodies_moved_by_link(self) -> np.ndarray:
+        """Matrix of 0 and 1, shape (k + 1, m), with 1 if body j moves with link i; all bodies move with the base."""
         links = np.array(self.body_links)
         return np.concatenate([np.ones((1, len(links))), self._path_matrix[links].T])
 
@@ -167,22 +167,22 @@ class ArticulatedBodies(Module):
     # -- kinematics and inertia ---------------------------------------------------------------------------------------
 
     def poses(self, q) -> Poses:
-        """Return the places of all links, joints and bodies for joint coordinates q, shape (k,).
+        """Return the positions and orientations of all links, joints and bodies at joint coordinates q, shape (k,).
 
         The pose of each link in its parent is composed with that of the parent, then with that of the parent's parent,
         and so on with twice as many links each time, for all links at once.
         """
         slides = np.array(self.slides)[:, None]
-        turns = _rotations(self.axes, jnp.where(slides[:, 0], 0.0, q))
+        turns = _rotations_about_axes(self.axes, jnp.where(slides[:, 0], 0.0, q))
         strokes = jnp.where(slides, q[:, None] * self.axes, 0.0)
         rotations = jnp.concatenate([jnp.eye(3)[None], turns])
         positions = jnp.concatenate([jnp.zeros((1, 3)), self.places + strokes])
         references = np.array([0, *self.parents])  # the link in whose axes the pose of each link is known
         while references.any():
-            positions = positions[references] + _products(rotations[references], positions)
+            positions = positions[references] + _matrix_vector_products(rotations[references], positions)
             rotations = rotations[references] @ rotations
             references = references[references]
-        axes = _products(rotations[np.array(self.parents)], self.axes)
+        axes = _matrix_vector_products(rotations[np.array(self.parents)], self.axes)
         screws = jnp.where(
             slides,
             jnp.concatenate([jnp.zeros_like(axes), axes], axis=1),
@@ -190,31 +190,35 @@ class ArticulatedBodies(Module):
         )
         links = np.array(self.body_links)
         R = rotations[links]
-        centres, inertias = positions[links] + _products(R, self.centres), R @ self.inertias @ jnp.swapaxes(R, 1, 2)
+        centres, inertias = (
+            positions[links] + _matrix_vector_products(R, self.centres),
+            R @ self.inertias @ jnp.swapaxes(R, 1, 2),
+        )
         return Poses(rotations, positions, screws, centres, inertias)
 
     def composite_inertias(self, poses: Poses) -> SpatialInertias:
-        """Return for each link the inertia of all bodies that move with it, n = k + 1; the base moves all."""
+        """Return the composite inertia of each of k + 1 links: that of all bodies that move with the link."""
         centres, masses = poses.body_centres, self.masses[:, None]
         squares = jnp.sum(centres**2, axis=1)[:, None, None] * jnp.eye(3) - centres[:, :, None] * centres[:, None, :]
         rotational = poses.body_inertias + masses[:, :, None] * squares
         inertias = jnp.concatenate([masses, masses * centres, rotational.reshape(-1, 9)], axis=1)
-        sums = jnp.asarray(self._bodies_beyond) @ inertias
+        sums = jnp.asarray(self._bodies_moved_by_link) @ inertias
         return SpatialInertias(sums[:, 0], sums[:, 1:4], sums[:, 4:].reshape(-1, 3, 3))
 
     def screws(self, poses: Poses) -> jax.Array:
-        """Return the screws of all velocities: the six of a free base, angular ones first, then those of the joints."""
+        """Return the screw axes of all velocities: six of a free base, angular ones first, then one of each joint."""
         return jnp.concatenate([jnp.eye(6)[: self._n_base_screws], poses.joint_screws])
 
     def _inertia_matrix(self, screws, composites: SpatialInertias) -> jax.Array:
-        """Return the matrix H of the kinetic energy ``v . H v / 2``, v the velocities along all screws, shape (n, n).
+        """Return the inertia matrix H, shape (n, n), of the kinetic energy ``v . H v / 2`` of velocities v along
+        screws.
 
         By the composite-body recursion: ``H_ij = S_j . I_i S_i`` if j is i or moves all that i moves, and I_i is the
         inertia of all bodies that i moves.
         """
         b = self._n_base_screws
         links = np.array([0] * b + list(range(1, self.n_joints + 1)))
-        momenta = SpatialInertias(*(part[links] for part in composites)).momentum(screws)
+        momenta = SpatialInertias(*(composite[links] for composite in composites)).momentum(screws)
         is_below = np.pad(self._path_matrix[1:], ((b, 0), (b, 0)))  # (i, j): screw j is i or moves all that i moves
         is_below[:, :b] = np.tri(b + self.n_joints, b, dtype=bool)
         entries = jnp.where(is_below, momenta @ screws.T, 0.0)
@@ -226,7 +230,8 @@ class ArticulatedBodies(Module):
         return self._inertia_matrix(self.screws(poses), self.composite_inertias(poses))
 
     def mass_matrix(self, q) -> jax.Array:
-        """Return M(q), shape (3 + k, 3 + k), for which the kinetic energy is ``(Omega, q') . M(q) (Omega, q') / 2``.
+        """Return the mass matrix M(q) of the kinetic energy ``(Omega, q') . M(q) (Omega, q') / 2``, shape (3 + k, 3 +
+        k).
 
         The linear momentum is zero. M is the matrix of a free base by the composite-body recursion, with the linear
         velocity eliminated by a Schur complement, whose pivot is the total mass. On the ground M has the shape (k, k).
@@ -234,33 +239,36 @@ class ArticulatedBodies(Module):
         H = self._inertia_matrix_at(q)
         if self.is_fixed:
             return H
-        kept = np.delete(np.arange(len(H)), [3, 4, 5])
-        linear = H[3:6, kept]
-        return H[np.ix_(kept, kept)] - linear.T @ linear / jnp.sum(self.masses)
+        velocity_indices = np.delete(np.arange(len(H)), [3, 4, 5])
+        linear = H[3:6, velocity_indices]
+        return H[np.ix_(velocity_indices, velocity_indices)] - linear.T @ linear / jnp.sum(self.masses)
 
     # -- energy and velocities of given momenta -----------------------------------------------------------------------
 
     def momentum_scale(self, Pi, q, p) -> jax.Array:
-        """Return the size of the terms whose sum is the angular momentum, shape (): ``sqrt(2 T J)``.
+        """Return the magnitude of the terms of the angular momentum, at which it is rounded, shape (): ``sqrt(2 T J)``.
 
         T is the kinetic energy, and J the trace of the locked inertia about the origin of the base. The terms of a tree
         without angular momentum cancel.
         """
-        locked = jnp.trace(self.composite_inertias(self.poses(q)).rotational[0])
-        return jnp.sqrt(2.0 * self.kinetic_energy(Pi, q, p) * locked)
+        locked_inertia = jnp.trace(self.composite_inertias(self.poses(q)).rotational[0])
+        return jnp.sqrt(2.0 * self.kinetic_energy(Pi, q, p) * locked_inertia)
 
-    def pivots(self, q) -> jax.Array:
-        """Return the inertia that each joint moves if all joints beyond it are free, shape (k,)."""
+    def articulated_joint_inertias(self, q) -> jax.Array:
+        """Return the articulated-body inertia of each joint, shape (k,): what it moves if the joints beyond are
+        free."""
         H = self._inertia_matrix_at(q)
         steps = _eliminate_velocities(H, jnp.zeros(len(H)))
         return jnp.stack([step.pivot for step in steps[: self.n_joints]])[::-1]
 
     def kinetic_energy(self, Pi, q, p) -> jax.Array:
         """Return the kinetic energy ``(Pi, p) . M(q)^-1 (Pi, p) / 2``, a sum of squares."""
-        return _sum_of_squares(_eliminate_velocities(self._inertia_matrix_at(q), self._momenta(Pi, p)))
+        return _kinetic_energy_from_elimination(
+            _eliminate_velocities(self._inertia_matrix_at(q), self._momenta_along_screws(Pi, p))
+        )
 
-    def _momenta(self, Pi, p) -> jax.Array:
-        """Return the momenta that belong to all screws. Without linear momentum Pi is the same about every point."""
+    def _momenta_along_screws(self, Pi, p) -> jax.Array:
+        """Return the momenta along all screws, for an angular momentum Pi, joint momenta p and no linear momentum."""
         return p if self.is_fixed else jnp.concatenate([Pi, jnp.zeros(3), p])
 
     def motion(self, Pi, q, p) -> Motion:
@@ -279,28 +287,30 @@ class ArticulatedBodies(Module):
         composites, screws = self.composite_inertias(poses), self.screws(poses)
         # behind barriers: otherwise XLA computes both again for each of their uses
         H = jax.lax.optimization_barrier(self._inertia_matrix(screws, composites))
-        steps = _eliminate_velocities(H, self._momenta(Pi, p))
-        rates = jax.lax.optimization_barrier(_velocities(steps))
+        steps = _eliminate_velocities(H, self._momenta_along_screws(Pi, p))
+        rates = jax.lax.optimization_barrier(_velocities_from_elimination(steps))
         moves = np.concatenate([np.ones((self.n_joints + 1, b)), self._path_matrix], axis=1)
         velocities = moves @ (rates[:, None] * screws)
-        momenta = self._bodies_beyond[1:] @ self._body_momenta(poses, velocities[np.array(self.body_links)])
-        gradient = jnp.sum(momenta * _motion_cross(poses.joint_screws, velocities[1:]), axis=1)
+        momenta = self._bodies_moved_by_link[1:] @ self._body_momenta(poses, velocities[np.array(self.body_links)])
+        gradient = jnp.sum(momenta * _spatial_cross_products(poses.joint_screws, velocities[1:]), axis=1)
         diagonals = [jnp.diagonal(composites.rotational, axis1=1, axis2=2), jnp.tile(composites.mass[:, None], 3)]
         scales = jnp.sum(jnp.abs(velocities) * jnp.sqrt(jnp.concatenate(diagonals, axis=1)), axis=1) ** 2
         angular_velocity = jnp.zeros(3) if self.is_fixed else rates[:3]
-        return Motion(_sum_of_squares(steps), angular_velocity, rates[b:], gradient, 0.5 * jnp.sum(scales))
+        return Motion(
+            _kinetic_energy_from_elimination(steps), angular_velocity, rates[b:], gradient, 0.5 * jnp.sum(scales)
+        )
 
     def _body_momenta(self, poses: Poses, velocities) -> jax.Array:
         """Return the spatial momentum of each body at its spatial velocity, both of shape (m, 6)."""
         centres, omega = poses.body_centres, velocities[:, :3]
         linear = self.masses[:, None] * (velocities[:, 3:] + jnp.cross(omega, centres))
-        angular = _products(poses.body_inertias, omega) + jnp.cross(centres, linear)
+        angular = _matrix_vector_products(poses.body_inertias, omega) + jnp.cross(centres, linear)
         return jnp.concatenate([angular, linear], axis=1)
 
     # -- gravity ------------------------------------------------------------------------------------------------------
 
-    def common_centre(self, poses: Poses) -> jax.Array:
-        """Return the centre of mass of the whole, from the origin of the base, shape (3,)."""
+    def centre_of_mass_in_base(self, poses: Poses) -> jax.Array:
+        """Return the centre of mass of the tree relative to the origin of the base, shape (3,)."""
         return self.masses @ poses.body_centres / jnp.sum(self.masses)
 
     def weight_potential(self, q, gravity) -> jax.Array:
@@ -310,35 +320,35 @@ class ArticulatedBodies(Module):
     def weight_forces(self, q, gravity) -> jax.Array:
         """Return the forces of a uniform field on the joint coordinates, shape (k,)."""
         forces = self.masses[:, None] * gravity
-        return self._collect_wrenches(self.poses(q), forces, jnp.zeros_like(forces))[0]
+        return self._joint_forces_and_total_wrench(self.poses(q), forces, jnp.zeros_like(forces))[0]
 
-    def tidal_forces(self, q, direction) -> tuple[jax.Array, jax.Array]:
-        """Return the torque on the whole, shape (3,), and the joint forces, shape (k,), in a gradient of gravity.
+    def gravity_gradient_forces(self, q, direction) -> tuple[jax.Array, jax.Array]:
+        """Return the gravity-gradient torque on the tree, shape (3,), and forces on the joints, shape (k,).
 
         A point at rho from the centre of mass has the acceleration ``3 n (n . rho) - rho`` for a unit vector n to the
         centre of the orbit, in axes of the base, times ``G M / r**3``. The inertia of a body about its own centre of
         mass adds the torque ``3 n × I n`` [Hughes, *Spacecraft Attitude Dynamics*, 1986, 8.1].
         """
         poses, n = self.poses(q), direction
-        offsets = poses.body_centres - self.common_centre(poses)
+        offsets = poses.body_centres - self.centre_of_mass_in_base(poses)
         forces = self.masses[:, None] * (3.0 * (offsets @ n)[:, None] * n - offsets)
         torques = 3.0 * jnp.cross(n, poses.body_inertias @ n)
-        joint_forces, total = self._collect_wrenches(poses, forces, torques)
+        joint_forces, total = self._joint_forces_and_total_wrench(poses, forces, torques)
         return total[:3], joint_forces  # the total force is zero, so the torque is the same about every point
 
-    def _collect_wrenches(self, poses: Poses, forces, torques) -> tuple[jax.Array, jax.Array]:
-        """Return the joint forces, shape (k,), and the total wrench, shape (6,), of forces and torques on the bodies.
+    def _joint_forces_and_total_wrench(self, poses: Poses, forces, torques) -> tuple[jax.Array, jax.Array]:
+        """Sum forces and torques on the bodies; return the joint forces, shape (k,), and the total wrench, shape (6,).
 
         Each force acts in the centre of mass of its body; both have the shape (m, 3). The wrench is (torque about the
         origin of the base, force).
         """
         wrenches = jnp.concatenate([torques + jnp.cross(poses.body_centres, forces), forces], axis=1)
-        sums = self._bodies_beyond @ wrenches
+        sums = self._bodies_moved_by_link @ wrenches
         return jnp.sum(poses.joint_screws * sums[1:], axis=1), sums[0]
 
 
 class _Elimination(NamedTuple):
-    """The last velocity, eliminated from the kinetic energy of given momenta.
+    """One step of the elimination of velocities from the kinetic energy at given momenta.
 
     Attributes
     ----------
@@ -362,47 +372,47 @@ def _eliminate_velocities(H, momenta) -> list[_Elimination]:
     numbers because of bodies that lie nearer to the base.
     """
     steps: list[_Elimination] = []
-    for last in reversed(range(len(H))):
-        step = _Elimination(H[:last, last], H[last, last], momenta[last])
+    for last_index in reversed(range(len(H))):
+        step = _Elimination(H[:last_index, last_index], H[last_index, last_index], momenta[last_index])
         steps.append(step)
-        H = H[:last, :last] - jnp.outer(step.column, step.column / step.pivot)
-        momenta = momenta[:last] - step.column * (step.momentum / step.pivot)
+        H = H[:last_index, :last_index] - jnp.outer(step.column, step.column / step.pivot)
+        momenta = momenta[:last_index] - step.column * (step.momentum / step.pivot)
     return steps
 
 
-def _velocities(steps: list[_Elimination]) -> jax.Array:
-    """Return the velocities at which the function of :func:`_eliminate_velocities` is smallest, shape (n,)."""
+def _velocities_from_elimination(eliminations: list[_Elimination]) -> jax.Array:
+    """Return the velocities, shape (n,), that belong to the momenta, by back-substitution."""
     v = jnp.zeros(0)
-    for step in reversed(steps):
+    for step in reversed(eliminations):
         v = jnp.concatenate([v, ((step.momentum - jnp.sum(step.column * v)) / step.pivot)[None]])
     return v
 
 
-def _sum_of_squares(steps: list[_Elimination]) -> jax.Array:
-    """Return the kinetic energy, a sum of squares: one for each eliminated velocity."""
-    return 0.5 * jnp.sum(jnp.stack([step.momentum**2 / step.pivot for step in steps]))
+def _kinetic_energy_from_elimination(eliminations: list[_Elimination]) -> jax.Array:
+    """Return the kinetic energy as a sum of squares, one for each eliminated velocity."""
+    return 0.5 * jnp.sum(jnp.stack([step.momentum**2 / step.pivot for step in eliminations]))
 
 
-def _products(matrices, vectors) -> jax.Array:
-    """Return the product of each matrix, shape (n, 3, 3), with its vector, shape (n, 3)."""
+def _matrix_vector_products(matrices, vectors) -> jax.Array:
+    """Return the products of n matrices, shape (n, 3, 3), with n vectors, shape (n, 3)."""
     return jnp.sum(matrices * vectors[:, None, :], axis=2)
 
 
-def _rotations(axes, angles) -> jax.Array:
-    """Return the rotations by angles, shape (n,), about unit vectors, shape (n, 3), by Rodrigues' formula."""
+def _rotations_about_axes(axes, angles) -> jax.Array:
+    """Return rotation matrices, shape (n, 3, 3), by angles about unit vectors, from Rodrigues' formula."""
     s, half = jnp.sin(angles)[:, None, None], jnp.sin(0.5 * angles)[:, None, None]
     # 1 - cos as a square, which keeps its digits at small angles
     outer_products = axes[:, :, None] * axes[:, None, :]
     return (1.0 - 2.0 * half**2) * jnp.eye(3) + s * _cross_matrices(axes) + 2.0 * half**2 * outer_products
 
 
-def _cross_matrices(v) -> jax.Array:
+def _cross_matrices(vectors) -> jax.Array:
     """Return the matrices of ``v ×``, shape (n, 3, 3), of vectors of shape (n, 3)."""
-    return jnp.cross(v[:, None, :], jnp.eye(3)).swapaxes(1, 2)
+    return jnp.cross(vectors[:, None, :], jnp.eye(3)).swapaxes(1, 2)
 
 
-def _motion_cross(V, W) -> jax.Array:
-    """Return the rates of spatial velocities W that are fixed in bodies which move with V, all of shape (n, 6)."""
+def _spatial_cross_products(V, W) -> jax.Array:
+    """Return the spatial cross products ``V × W``: the rates of W fixed in bodies that move with V, shape (n, 6)."""
     linear = jnp.cross(V[:, :3], W[:, 3:]) + jnp.cross(V[:, 3:], W[:, :3])
     return jnp.concatenate([jnp.cross(V[:, :3], W[:, :3]), linear], axis=1)
 
@@ -420,16 +430,16 @@ class KineticEnergy(Energy):
     mechanism: ArticulatedBodies
 
     def split_state(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return angular momentum, joint coordinates and joint momenta, shapes (3,), (k,) and (k,).
+        """Split a state into angular momentum, joint coordinates and joint momenta, shapes (3,), (k,) and (k,).
 
         The angular momentum is zero if the base is the ground.
         """
-        k, first = self.mechanism.n_joints, self.mechanism.first_joint_index
-        Pi = x[:3] if first else jnp.zeros(3)
-        return Pi, x[first : first + k], x[first + k : first + 2 * k]
+        k, first_joint_index = self.mechanism.n_joints, self.mechanism.first_joint_index
+        Pi = x[:3] if first_joint_index else jnp.zeros(3)
+        return Pi, x[first_joint_index : first_joint_index + k], x[first_joint_index + k : first_joint_index + 2 * k]
 
     def momentum_scale(self, x) -> jax.Array:
-        """Return :meth:`ArticulatedBodies.momentum_scale` of a state."""
+        """Return the magnitude of the terms of the angular momentum at a state, shape ()."""
         return self.mechanism.momentum_scale(*self.split_state(x))
 
     def value(self, x) -> jax.Array:
@@ -442,19 +452,19 @@ class KineticEnergy(Energy):
         return jax.lax.stop_gradient(_kinetic_rounding_scale(self, x))
 
 
-@subprogram
+@jit_subprogram
 def _kinetic_energy(kinetic: KineticEnergy, x) -> jax.Array:
     return kinetic.mechanism.kinetic_energy(*kinetic.split_state(x))
 
 
-@subprogram
+@jit_subprogram
 def _kinetic_gradient(kinetic: KineticEnergy, x) -> jax.Array:
     motion = kinetic.mechanism.motion(*kinetic.split_state(x))
     velocity = [] if kinetic.mechanism.is_fixed else [motion.angular_velocity]
     return jnp.concatenate([*velocity, motion.joint_gradient, motion.joint_rates])
 
 
-@subprogram
+@jit_subprogram
 def _kinetic_rounding_scale(kinetic: KineticEnergy, x) -> jax.Array:
     return kinetic.mechanism.motion(*kinetic.split_state(x)).rounding_scale
 
@@ -483,12 +493,12 @@ class WeightPotential(Energy):
         return jax.lax.stop_gradient(_weight_rounding_scale(self, x))
 
 
-@subprogram
+@jit_subprogram
 def _weight_potential(weight: WeightPotential, x) -> jax.Array:
     return weight.mechanism.weight_potential(x[: weight.mechanism.n_joints], weight.gravity)
 
 
-@subprogram
+@jit_subprogram
 def _weight_rounding_scale(weight: WeightPotential, x) -> jax.Array:
     mechanism, q = weight.mechanism, x[: weight.mechanism.n_joints]
     strokes = jnp.where(np.array(mechanism.slides), jnp.abs(q), 0.0)
@@ -497,14 +507,14 @@ def _weight_rounding_scale(weight: WeightPotential, x) -> jax.Array:
     return jnp.linalg.norm(weight.gravity) * jnp.dot(mechanism.masses, arms)
 
 
-@subprogram
+@jit_subprogram
 def _weight_gradient(weight: WeightPotential, x) -> jax.Array:
     k = weight.mechanism.n_joints
     return jnp.concatenate([-weight.mechanism.weight_forces(x[:k], weight.gravity), jnp.zeros(k)])
 
 
 class SquaredMomentum(Pullback):
-    """The squared angular momentum of a tree, a Casimir, whose rounding is that of the terms of the momentum.
+    """The squared angular momentum of a tree, a Casimir, with the rounding error of the terms of the momentum.
 
     Attributes
     ----------
@@ -548,12 +558,12 @@ class JointSprings(Energy):
         return jnp.concatenate([jnp.zeros(self.first_joint_index), force, jnp.zeros_like(force)])
 
     def _deflections(self, x) -> jax.Array:
-        first = self.first_joint_index
-        return x[first : first + self.stiffness.shape[0]] - self.rest
+        first_joint_index = self.first_joint_index
+        return x[first_joint_index : first_joint_index + self.stiffness.shape[0]] - self.rest
 
 
 class JointDamping(Dissipation):
-    """Viscous dampers in the joints, ``p_i' = -c_i q_i'``; they change no momentum of the whole.
+    """Viscous dampers in the joints, ``p_i' = -c_i q_i'``; they conserve the angular momentum.
 
     Attributes
     ----------
@@ -576,18 +586,20 @@ class JointDamping(Dissipation):
         return Indices(0)
 
     @property
-    def _momenta(self) -> slice:
-        """Range of the joint momenta in a state."""
+    def _momenta_along_screws(self) -> slice:
+        """Slice of the joint momenta in a state."""
         k = self.coefficients.shape[0]
         return slice(self.first_joint_index + k, self.first_joint_index + 2 * k)
 
     def force(self, system, x, dH, dS, dL):
-        return jnp.zeros_like(dH).at[self._momenta].set(-self.coefficients * dH[self._momenta])
+        return (
+            jnp.zeros_like(dH).at[self._momenta_along_screws].set(-self.coefficients * dH[self._momenta_along_screws])
+        )
 
     def velocity(self, system, x, dH, dS, dL):
         return jnp.zeros_like(dH)
 
     def factor(self, system, x, dH, dL):
-        root, momenta = jnp.sqrt(self.coefficients), self._momenta
+        root, momenta = jnp.sqrt(self.coefficients), self._momenta_along_screws
         momentum_rates = lambda w: jnp.zeros_like(x).at[momenta].set(root * w)  # noqa: E731
         return Factor(root.shape[0], momentum_rates, True, velocity=lambda w: jnp.zeros_like(x))

@@ -47,7 +47,7 @@ class _BearingFriction(Module):
 
 
 class _TorqueOfMomentum(Module):
-    """An external force that is a torque at the time and the momentum ``l_xi``."""
+    """An external force: a torque that depends on time and on the momentum ``l_xi``."""
 
     lagrangian: _Lagrangian
     torque: Any
@@ -106,8 +106,8 @@ def body_with_wheels(
     lagrangian = _Lagrangian(body, wheel, checked_positive(heat, "heat"), checked_positive(temperature, "temperature"))
     bearing = _BearingFriction(checked_positive(friction, "friction"))
     if attitude:
-        whole = jnp.diag(wheel) + (body if body.ndim == 2 else jnp.diag(body))
-        arrays: dict[str, Any] = {"inertia": whole, "axes": jnp.eye(3), "wheels": wheel}
+        total_inertia = jnp.diag(wheel) + (body if body.ndim == 2 else jnp.diag(body))
+        arrays: dict[str, Any] = {"inertia": total_inertia, "axes": jnp.eye(3), "wheels": wheel}
         return reaction_wheels(**arrays, friction=friction, capacity=heat, temperature=temperature, torque=torque)
     algebra = mf.direct_sum(mf.so(3), mf.abelian(3))
     external = None

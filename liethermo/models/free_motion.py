@@ -37,8 +37,8 @@ class Periods(NamedTuple):
 
 
 def periods(inertia, momentum, energy=None) -> Periods:
-    """Return the periods of a free body by elliptic integrals [Landau & Lifshitz, Mechanics §37; Samarasinha & A'Hearn
-    1991].
+    """Return the periods of a free body from elliptic integrals [Landau & Lifshitz, Mechanics §37; Samarasinha &
+    A'Hearn 1991].
 
     With ``I_1 <= I_2 <= I_3`` and ``L**2 > 2 E I_2`` the angular momentum circles about the axis of ``I_3`` in body
     axes (short-axis mode), with ``L**2 < 2 E I_2`` about that of ``I_1`` (long-axis mode).
@@ -156,10 +156,10 @@ def rate_of(relaxation_time, inertia, momentum) -> jax.Array:
     smallest_moment, middle_moment, greatest_moment = jnp.moveaxis(jnp.sort(moments, axis=-1), -1, 0)
     is_unequal = greatest_moment - smallest_moment > EQUAL_MOMENTS_RTOL * greatest_moment
     require_condition(is_unequal, lambda v: v, "a body with three equal moments has no nutation to relax")
-    is_rod = greatest_moment - middle_moment <= EQUAL_MOMENTS_RTOL * greatest_moment
+    is_slender_rod = greatest_moment - middle_moment <= EQUAL_MOMENTS_RTOL * greatest_moment
     d1 = (greatest_moment - smallest_moment) / (greatest_moment * smallest_moment)
     ratio = jnp.where(
-        is_rod,
+        is_slender_rod,
         0.0,
         (greatest_moment - middle_moment) * smallest_moment / ((greatest_moment - smallest_moment) * middle_moment),
     )  # d_2 / d_1

@@ -55,7 +55,7 @@ class PrincipalAxes(NamedTuple):
 
 
 def checked_inertia(inertia, allow_rod: bool = False) -> np.ndarray | jax.Array:
-    """Return moments of inertia, shape (3,), or a tensor, shape (3, 3), of one body, and warn if no body can have them.
+    """Return the moments, shape (3,), or the tensor, shape (3, 3), of inertia of a body; warn if no body can have them.
 
     A diagonal tensor is returned as its moments.
 
@@ -87,7 +87,7 @@ def checked_inertia(inertia, allow_rod: bool = False) -> np.ndarray | jax.Array:
         if not (array - np.diag(np.diag(array))).any():
             array = np.diag(array).copy()
     moments = array if array.ndim == 1 else np.linalg.eigvalsh(array)
-    if allow_rod and np.isfinite(moments).all() and is_rod(moments):
+    if allow_rod and np.isfinite(moments).all() and is_slender_rod(moments):
         return array
     require_condition(moments, _are_positive, POSITIVE_MOMENTS_TEXT)
     warn_of_impossible_moments(moments)
@@ -95,9 +95,9 @@ def checked_inertia(inertia, allow_rod: bool = False) -> np.ndarray | jax.Array:
 
 
 def warn_of_impossible_moments(moments: np.ndarray) -> None:
-    """Warn if no rigid body has the first of the moments, shape (..., 3), that break the triangle inequalities."""
+    """Warn if moments of inertia, shape (..., 3), violate the triangle inequalities, as no rigid body has them."""
     rows = moments.reshape(-1, 3)
-    is_impossible = ~_obey_triangle_inequalities(rows)
+    is_impossible = ~_which_satisfy_triangle_inequalities(rows)
     if not is_impossible.any():
         return
     row = rows[int(np.argmax(is_impossible))]
@@ -111,10 +111,10 @@ def warn_of_impossible_moments(moments: np.ndarray) -> None:
     )
 
 
-def is_rod(moments: np.ndarray) -> bool:
-    """Return whether moments, shape (3,), are those of a slender rod: one is zero and the others are equal."""
-    least, middle, greatest = np.sort(moments).tolist()
-    return abs(least) <= ROD_RTOL * greatest and greatest - middle <= EQUAL_MOMENTS_RTOL * greatest
+def is_slender_rod(moments: np.ndarray) -> bool:
+    """Return True if moments of inertia, shape (3,), are those of a slender rod: one is zero, the others are equal."""
+    min_moment, median_moment, max_moment = np.sort(moments).tolist()
+    return abs(min_moment) <= ROD_RTOL * max_moment and max_moment - median_moment <= EQUAL_MOMENTS_RTOL * max_moment
 
 
 def _are_positive(moments):
@@ -186,7 +186,7 @@ def are_inertia_tensors(inertia) -> bool:
             "array. Give the moments of one body, shape (3,), and use jax.vmap for many"
         )
     blocks = np.asarray(inertia, dtype=np.float64)
-    if not np.isfinite(blocks).all() or not is_symmetric(blocks):
+    if not np.isfinite(blocks).all() or not are_symmetric_to_rounding(blocks):
         return False
     principal = np.linalg.eigvalsh(blocks)
     is_positive_definite = bool((principal > 0.0).all())
@@ -203,16 +203,20 @@ def are_inertia_tensors(inertia) -> bool:
 
 
 def checked_inertia_tensors(tensors, allow_rod: bool = False) -> np.ndarray:
-    """Return tensors of inertia, shape (..., 3, 3), made exactly symmetric; invalid ones are refused."""
+    """Return tensors of inertia, shape (..., 3, 3), made exactly symmetric, after checking that they are valid."""
     blocks = np.asarray(tensors, dtype=np.float64)
     if not np.isfinite(blocks).all():
         raise InputError(f"a tensor of inertia must be finite, got {blocks.tolist()}")
-    if not is_symmetric(blocks):
-        raise InputError(f"a tensor of inertia must be symmetric, got {blocks.tolist()}")
+    if not are_symmetric_to_rounding(blocks):
+        asymmetry = np.abs(blocks - blocks.swapaxes(-1, -2)).max()
+        raise InputError(
+            f"a tensor of inertia must be symmetric, but it differs from its transpose by {asymmetry:.3g}: "
+            f"{blocks.tolist()}. Use (I + I.T) / 2 if this is an error of measurement"
+        )
     blocks = 0.5 * (blocks + blocks.swapaxes(-1, -2))
     principal = np.linalg.eigvalsh(blocks)
     min_moment = float(principal.min())
-    if allow_rod and blocks.ndim == 2 and is_rod(principal):
+    if allow_rod and blocks.ndim == 2 and is_slender_rod(principal):
         return blocks
     if min_moment <= 0.0:
         raise InputError(f"a tensor of inertia must be positive definite, got the principal moment {min_moment:g}")
@@ -234,7 +238,7 @@ def principal_moments(inertia) -> jax.Array:
 
 
 def inverse_inertia(inertia) -> jax.Array:
-    """Return the inverse of a tensor of inertia, shape (3, 3), or of each of three moments, shape (3,).
+    """Return the inverse of a tensor of inertia, shape (3, 3), or the reciprocals of three moments, shape (3,).
 
     About the axis of a slender rod, where the moment is zero, the inverse is zero: the rod does not turn about it.
     """
@@ -243,7 +247,7 @@ def inverse_inertia(inertia) -> jax.Array:
         return real_array(inverse_moments(inertia))
     if not is_traced(inertia):
         moments, axes = np.linalg.eigh(np.asarray(inertia))
-        if is_rod(moments):
+        if is_slender_rod(moments):
             inverse_of_rod = np.append(0.0, 1.0 / moments[1:])
             return real_array(axes * inverse_of_rod @ axes.T)
     inverse = jnp.linalg.inv(inertia)
@@ -251,23 +255,23 @@ def inverse_inertia(inertia) -> jax.Array:
 
 
 def inverse_moments(moments):
-    """Return the inverse of each moment of inertia, zero for a moment of zero; NumPy computes with its own arrays."""
+    """Return the reciprocal of each moment of inertia, and 0 for a moment of 0; NumPy arrays stay NumPy arrays."""
     xp, is_zero = np if isinstance(moments, np.ndarray) else jnp, moments == 0.0
     return xp.where(is_zero, 0.0, 1.0 / xp.where(is_zero, 1.0, moments))
 
 
-def is_symmetric(blocks: np.ndarray) -> bool:
-    """Return True if blocks of shape (..., 3, 3) are symmetric to rounding, each relative to its largest entry."""
-    asymmetry = np.abs(blocks - blocks.swapaxes(-1, -2)).max(axis=(-2, -1))
-    return bool((asymmetry <= SYMMETRY_RTOL * np.abs(blocks).max(axis=(-2, -1))).all())
+def are_symmetric_to_rounding(matrices: np.ndarray) -> bool:
+    """Return True if all matrices, shape (..., 3, 3), are symmetric to rounding, relative to their largest entry."""
+    asymmetry = np.abs(matrices - matrices.swapaxes(-1, -2)).max(axis=(-2, -1))
+    return bool((asymmetry <= SYMMETRY_RTOL * np.abs(matrices).max(axis=(-2, -1))).all())
 
 
 def satisfies_triangle_inequalities(moments: np.ndarray) -> bool:
     """Return True if moments of shape (..., 3) obey ``I_i <= I_j + I_k``, as the moments of every rigid body do."""
-    return bool(_obey_triangle_inequalities(moments).all())
+    return bool(_which_satisfy_triangle_inequalities(moments).all())
 
 
-def _obey_triangle_inequalities(moments: np.ndarray) -> np.ndarray:
-    """Return which of the moments of shape (..., 3) are those of a rigid body; NaN are those of none."""
+def _which_satisfy_triangle_inequalities(moments: np.ndarray) -> np.ndarray:
+    """Return True for each triple of moments, shape (..., 3), that a rigid body can have; False if one is NaN."""
     max_moments = moments.max(axis=-1)
     return max_moments <= (moments.sum(axis=-1) - max_moments) * (1.0 + INEQUALITY_RTOL)

@@ -18,6 +18,7 @@ from manifolds._pytree_module import Module
 from ..errors import InputError
 from ..functions.energy import Energy, Pullback, Sum
 from ..systems.base import System
+from ..systems.body_states import entropies_of_temperatures
 from ..systems.interface import EngineHints, MotionQuantities
 from ..tracing.programs import jit_unoptimised
 from .articulated_bodies import ArticulatedBodies, JointDamping, JointSprings, KineticEnergy, Motion
@@ -34,7 +35,7 @@ JointRange = tuple[str, int, int]
 
 
 class JointMotors(Module):
-    """Torques of motors in the joints, as functions of the time.
+    """The torques of the motors in the joints of a tree, as a function of time.
 
     Attributes
     ----------
@@ -69,7 +70,7 @@ class TreeSystem(System):
     @property
     @abstractmethod
     def joint_ranges(self) -> tuple[JointRange, ...]:
-        """Name of each body that has a joint, and the first and the last but one index of its coordinates."""
+        """Name of each body that has a joint, and the start and stop index of the joint's coordinates in a state."""
 
     @property
     def mechanism(self) -> ArticulatedBodies:
@@ -85,7 +86,7 @@ class TreeSystem(System):
 
     @with_library_settings
     def mass_matrix(self, q) -> jax.Array:
-        """Return M(q), for which the kinetic energy is ``(Omega, q') . M (Omega, q') / 2``, or ``q' . M q' / 2``.
+        """Return the mass matrix M(q) of the kinetic energy ``(Omega, q') . M (Omega, q') / 2``, or ``q' . M q' / 2``.
 
         Parameters
         ----------
@@ -107,8 +108,11 @@ class TreeSystem(System):
 
         Each has the shape (...), or (..., 2) for a universal joint (rad/s or m/s).
         """
-        rates, first = self._motion(x).joint_rates, self.mechanism.first_joint_index
-        return {name: _entries(rates, start - first, end - first) for name, start, end in self.joint_ranges}
+        rates, first_joint_index = self._motion(x).joint_rates, self.mechanism.first_joint_index
+        return {
+            name: _entries_of_joint(rates, start - first_joint_index, end - first_joint_index)
+            for name, start, end in self.joint_ranges
+        }
 
     @property
     def motion_quantities(self) -> MotionQuantities:
@@ -122,34 +126,51 @@ class TreeSystem(System):
     @with_library_settings
     def _motion(self, x) -> Motion:
         x = self.state(x, batch=True)
-        flat = _motions(self.mechanism, x.reshape(-1, self.dim))
-        return Motion(*(part.reshape(*x.shape[:-1], *part.shape[1:]) for part in flat))
+        flat_motion = _motions(self.mechanism, x.reshape(-1, self.dim))
+        return Motion(*(array.reshape(*x.shape[:-1], *array.shape[1:]) for array in flat_motion))
 
-    def _joint_vector(self, values: Mapping[str, Any] | None, argument: str) -> jax.Array:
-        """Return coordinates or rates of all joints, shape (k,) or (B, k), from those that are given by name."""
+    def _joint_vector_from_names(
+        self, values: Mapping[str, Any] | None, argument_name: str, degrees: bool
+    ) -> jax.Array:
+        """Return coordinates or rates of all joints, shape (k,) or (B, k), from values by body name; others are 0.
+
+        Angles may be given in degrees; the result has radians. Displacements of sliders have one unit only.
+        """
         if not isinstance(values, Mapping | None):
-            raise InputError(f"{argument} must be a dict by the names of bodies, got {type(values).__name__}")
+            raise InputError(f"{argument_name} must be a dict by the names of bodies, got {type(values).__name__}")
         values = dict(values or {})
         names = [name for name, _, _ in self.joint_ranges]
         if unknown := [name for name in values if name not in names]:
             raise InputError(f"no joint moves {', '.join(map(repr, unknown))}. The joints move {', '.join(names)}")
         columns = []
         for name, start, end in self.joint_ranges:
-            size, what = end - start, f"{argument}[{name!r}]"
-            array = checked_finite(values.get(name, np.zeros(size)), what)
-            array = array[..., None] if size == 1 and array.shape[-1:] != (1,) else array
-            if array.shape[-1:] != (size,) or array.ndim > 2:
-                raise InputError(f"{what} must have shape ({size},), or (B, {size}), got {array.shape}")
+            n_coordinates, argument_text = end - start, f"{argument_name}[{name!r}]"
+            array = checked_finite(values.get(name, np.zeros(n_coordinates)), argument_text)
+            array = array[..., None] if n_coordinates == 1 and array.shape[-1:] != (1,) else array
+            if array.shape[-1:] != (n_coordinates,) or array.ndim > 2:
+                raise InputError(
+                    f"{argument_text} must have shape ({n_coordinates},), or (B, {n_coordinates}), got {array.shape}"
+                )
             columns.append(array)
         try:
             shape = jnp.broadcast_shapes(*(column.shape[:-1] for column in columns))
         except ValueError:
-            raise InputError(f"the entries of {argument} have different lengths") from None
-        return jnp.concatenate([jnp.broadcast_to(c, (*shape, c.shape[-1])) for c in columns], axis=-1)
+            raise InputError(f"the entries of {argument_name} have different lengths") from None
+        vector = jnp.concatenate([jnp.broadcast_to(c, (*shape, c.shape[-1])) for c in columns], axis=-1)
+        return jnp.where(np.array(self.mechanism.slides), vector, jnp.deg2rad(vector)) if degrees else vector
+
+    def _append_entropies(self, x, temperature) -> jax.Array:
+        """Return states of bodies, shape (..., n), with the entropy of the bath at a temperature, if one is given."""
+        if temperature is None:
+            return x
+        if self.baths is None:
+            raise InputError("temperature= needs a bath. Build the system by tree.system(baths=lt.HeatBaths(...))")
+        y = entropies_of_temperatures(self.baths, temperature)
+        return jnp.concatenate([*broadcast_batches(x, y)], axis=-1)
 
 
 def broadcast_batches(*arrays: jax.Array) -> tuple[jax.Array, ...]:
-    """Return arrays of shape (n_i,) or (B, n_i) with one shape of their leading axes, () or (B,)."""
+    """Broadcast arrays of shape (n_i,) or (B, n_i) to a common batch shape, () or (B,)."""
     batch_shapes = [array.shape[:-1] for array in arrays]
     try:
         shape = jnp.broadcast_shapes(*batch_shapes)
@@ -159,7 +180,7 @@ def broadcast_batches(*arrays: jax.Array) -> tuple[jax.Array, ...]:
 
 
 def checked_vectors(value, name: str) -> jax.Array:
-    """Return a finite vector of a state, shape (3,), or those of many states, shape (B, 3)."""
+    """Return finite vectors as an array of shape (3,) or (B, 3), one for each state."""
     vector = checked_finite(value, name)
     if vector.shape[-1:] != (3,) or vector.ndim > 2:
         raise InputError(f"{name} must have shape (3,), or (B, 3) for many states, got {vector.shape}")
@@ -167,19 +188,19 @@ def checked_vectors(value, name: str) -> jax.Array:
 
 
 def kinetic_and_spring_terms(mechanism: ArticulatedBodies, springs: JointSprings) -> list[Energy]:
-    """Return the terms of the energy of a tree without gravity."""
+    """Return the terms of the energy of a tree: kinetic energy, and springs if there are any."""
     has_springs = is_traced(springs.stiffness) or np.asarray(springs.stiffness).any()
     return [KineticEnergy(mechanism), *([springs] if has_springs else [])]
 
 
-def joint_damping(coefficients, first_joint_index: int) -> JointDamping | None:
-    """Return the dampers of the joints; None without any."""
+def make_joint_damping(coefficients, first_joint_index: int) -> JointDamping | None:
+    """Return the dissipation of the dampers in the joints; None if all coefficients are 0."""
     is_damped = is_traced(coefficients) or np.asarray(coefficients).any()
     return JointDamping(coefficients, first_joint_index) if is_damped else None
 
 
 def sum_of_terms(terms: list[Energy]) -> Energy:
-    """Return the sum of terms of an energy, or the only one."""
+    """Return the sum of the terms of an energy as one energy."""
     return terms[0] if len(terms) == 1 else Sum(tuple(terms))
 
 
@@ -194,6 +215,7 @@ def _motions(mechanism: ArticulatedBodies, x) -> Motion:
     return jax.vmap(lambda y: mechanism.motion(*kinetic.split_state(y)))(x)
 
 
-def _entries(values, start: int, end: int):
-    """Return some components of values, shape (..., k): shape (...) for one, (..., end - start) for more."""
+def _entries_of_joint(values, start: int, end: int):
+    """Return the entries of one joint, from ``start`` to ``end``, of values of shape (..., k); one entry without its
+    axis."""
     return values[..., start] if end - start == 1 else values[..., start:end]

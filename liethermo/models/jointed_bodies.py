@@ -28,11 +28,11 @@ from .joint_states import (
     TreeSystem,
     broadcast_batches,
     checked_vectors,
-    joint_damping,
     kinetic_and_spring_terms,
+    make_joint_damping,
     sum_of_terms,
 )
-from .orbits import Orbit, direction_and_distance
+from .orbits import Orbit, direction_and_distance_to_centre
 
 
 class JointedBodies(TreeSystem, LiePoissonSystem):
@@ -90,7 +90,7 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
             falling = Quadratic(jnp.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) / mass, jnp.pad(-mass * gravity, (0, 3)))
             terms.append(falling.on(range(n, dim)))
         validate = False  # the axioms hold for every tree
-        self._build(poisson, dim, sum_of_terms(terms), None, joint_damping(damping, 3), (), validate, baths=baths)
+        self._build(poisson, dim, sum_of_terms(terms), None, make_joint_damping(damping, 3), (), validate, baths=baths)
 
     @property
     def joint_ranges(self) -> tuple[JointRange, ...]:
@@ -109,16 +109,18 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
 
     def _torque_at(self, x, t, attitude):
         k = self.mechanism.n_joints
-        on_body, on_joints = jnp.zeros(3), jnp.zeros(k)
+        body_torque, joint_forces = jnp.zeros(3), jnp.zeros(k)
         if self.orbit is not None:
-            direction, distance = direction_and_distance(self.orbit, t)
+            direction, distance = direction_and_distance_to_centre(self.orbit, t)
             # without the barrier XLA crashes on products of many such matrices with vectors
             n = jax.lax.optimization_barrier(attitude).T @ direction
             strength = self.orbit.mean_motion**2 / distance**3
-            on_body, on_joints = (strength * part for part in self.mechanism.tidal_forces(x[3 : 3 + k], n))
+            body_torque, joint_forces = (
+                strength * force for force in self.mechanism.gravity_gradient_forces(x[3 : 3 + k], n)
+            )
         if self.motors is not None:
-            on_joints = on_joints + self.motors(t)
-        forces = jnp.concatenate([on_body, jnp.zeros(k), on_joints])
+            joint_forces = joint_forces + self.motors(t)
+        forces = jnp.concatenate([body_torque, jnp.zeros(k), joint_forces])
         if self.torque is None:
             return forces
         return jnp.pad(super()._torque_at(x, t, attitude), (0, 2 * k)) + forces
@@ -147,20 +149,20 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         return self._motion(x).angular_velocity
 
     @property
-    def _centre_start(self) -> int | None:
-        """Index of the position of the centre of mass in a state; None without one."""
+    def _centre_of_mass_index(self) -> int | None:
+        """Index of the position of the centre of mass in a state; None if the state has no position."""
         n = 3 + 2 * self.mechanism.n_joints
         return n if self.body_dim > n else None
 
     def centre_of_mass(self, x) -> jax.Array:
-        """Return the common centre of mass in axes in space, shape (..., 3), at states x, shape (..., n).
+        """Return the centre of mass of the tree in axes in space, shape (..., 3), at states x, shape (..., n).
 
         Raises
         ------
         InputError
             If the tree has no position, since it was built without ``gravity=(gx, gy, gz)``.
         """
-        start = self._centre_start
+        start = self._centre_of_mass_index
         if start is None:
             raise InputError(
                 "the tree has no position: build it by tree.system(gravity=(0, 0, 0)), or in another field"
@@ -169,7 +171,7 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
 
     @with_library_settings
     def base_position(self, x, attitude) -> jax.Array:
-        """Return the origin of the base in axes in space, shape (..., 3).
+        """Return the position of the origin of the base in axes in space, shape (..., 3).
 
         Parameters
         ----------
@@ -180,8 +182,8 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         """
         x, k = self.state(x, batch=True), self.mechanism.n_joints
         q = x[..., 3 : 3 + k]
-        offsets = _common_centres(self.mechanism, q.reshape(-1, k)).reshape(*x.shape[:-1], 3)
-        centre = jnp.zeros(3) if self._centre_start is None else self.centre_of_mass(x)
+        offsets = _centres_of_mass_in_base(self.mechanism, q.reshape(-1, k)).reshape(*x.shape[:-1], 3)
+        centre = jnp.zeros(3) if self._centre_of_mass_index is None else self.centre_of_mass(x)
         return centre - jnp.einsum("...ij,...j->...i", jnp.asarray(attitude), offsets)
 
     # -- states -------------------------------------------------------------------------------------------------------
@@ -198,8 +200,10 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         joint_rates: Mapping[str, Any] | None = None,
         centre_of_mass=None,
         velocity=None,
+        temperature=None,
+        degrees: bool = False,
     ) -> jax.Array:
-        """Return a state, from velocities or from an array of its components.
+        """Make a state from momenta or velocities and joint coordinates, or check an array of components.
 
         Parameters
         ----------
@@ -220,6 +224,10 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         centre_of_mass, velocity : array, shape (3,) or (B, 3), optional
             Position (m) and velocity (m/s) of the common centre of mass in axes in space, of a tree in a uniform field
             of gravity; zero by default.
+        temperature : float, or array, shape (B, 1); optional
+            Temperature of the bath; by default that at zero entropy.
+        degrees : bool
+            If true, the angular velocity, joint angles and their rates are in degrees and degrees/s.
 
         Returns
         -------
@@ -228,36 +236,38 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         Raises
         ------
         InputError
-            If there is no joint of a name, or a shape does not fit.
+            If there is no joint of this name, a shape does not fit, or a temperature is given without a bath.
         """
-        velocities = angular_velocity, momentum, joints, joint_rates, centre_of_mass, velocity
+        details = angular_velocity, momentum, joints, joint_rates, centre_of_mass, velocity, temperature
         if x is not None:
-            if any(value is not None for value in velocities):
+            if degrees or any(value is not None for value in details):
                 raise InputError("give a state x, or velocities and joints by name, not both")
             return super().state(x, batch)
         if angular_velocity is not None and momentum is not None:
             raise InputError("give angular_velocity= or momentum=, not both")
-        q, rates = self._joint_vector(joints, "joints"), self._joint_vector(joint_rates, "joint_rates")
+        q = self._joint_vector_from_names(joints, "joints", degrees)
+        rates = self._joint_vector_from_names(joint_rates, "joint_rates", degrees)
         name = "angular_velocity" if momentum is None else "momentum"
         given_vectors = [v for v in (angular_velocity, momentum) if v is not None]
         vector = checked_vectors(given_vectors[0] if given_vectors else np.zeros(3), name)
         vector, q, rates, *translation = broadcast_batches(
-            vector, q, rates, *self._translation(centre_of_mass, velocity)
+            vector, q, rates, *self._translation_components(centre_of_mass, velocity)
         )
         M = self.mass_matrix(q)
         if momentum is None:
-            Omega = vector
+            Omega = jnp.deg2rad(vector) if degrees else vector
         else:
             residual = vector - jnp.einsum("...ij,...j->...i", M[..., :3, 3:], rates)
             Omega = jnp.linalg.solve(M[..., :3, :3], residual[..., None])[..., 0]
         momenta = jnp.einsum("...ij,...j->...i", M, jnp.concatenate([Omega, rates], axis=-1))
         Pi = momenta[..., :3] if momentum is None else vector
-        x = jnp.concatenate([Pi, q, momenta[..., 3:], *translation], axis=-1)
+        x = self._append_entropies(jnp.concatenate([Pi, q, momenta[..., 3:], *translation], axis=-1), temperature)
         return super().state(x, x.ndim > 1)
 
-    def _translation(self, centre_of_mass, velocity) -> tuple[jax.Array, ...]:
-        """Return position and momentum of the centre of mass for a state; nothing for a tree without a position."""
-        if self._centre_start is None:
+    def _translation_components(self, centre_of_mass, velocity) -> tuple[jax.Array, ...]:
+        """Return the components of a state for the position and momentum of the centre of mass; none without a
+        position."""
+        if self._centre_of_mass_index is None:
             if centre_of_mass is not None or velocity is not None:
                 raise InputError(
                     "centre_of_mass= and velocity= are for a tree with a position: build it by "
@@ -270,5 +280,5 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
 
 
 @jit_unoptimised
-def _common_centres(mechanism: ArticulatedBodies, q) -> jax.Array:
-    return jax.vmap(lambda q: mechanism.common_centre(mechanism.poses(q)))(q)
+def _centres_of_mass_in_base(mechanism: ArticulatedBodies, q) -> jax.Array:
+    return jax.vmap(lambda q: mechanism.centre_of_mass_in_base(mechanism.poses(q)))(q)

@@ -69,7 +69,9 @@ class Hinge:
     def __init__(self, at, axis, stiffness=0.0, damping=0.0, rest_angle=0.0, motor: Any = None):
         self.at = checked_finite(at, "at of a hinge", 3)
         self.motor = _checked_motor(motor, "a hinge")
-        self.coordinates = (_coordinate(axis, False, stiffness, rest_angle, damping, "a hinge", "rest_angle"),)
+        self.coordinates = (
+            _make_joint_coordinate(axis, False, stiffness, rest_angle, damping, "a hinge", "rest_angle"),
+        )
 
 
 class Slider:
@@ -106,7 +108,9 @@ class Slider:
         self.at = checked_finite(at, "at of a slider", 3)
         self.motor = _checked_motor(motor, "a slider")
         rest_name = "rest_displacement"
-        self.coordinates = (_coordinate(axis, True, stiffness, rest_displacement, damping, "a slider", rest_name),)
+        self.coordinates = (
+            _make_joint_coordinate(axis, True, stiffness, rest_displacement, damping, "a slider", rest_name),
+        )
 
 
 class Universal:
@@ -146,9 +150,9 @@ class Universal:
         self.motor = _checked_motor(motor, "a universal joint")
         directions = checked_numbers(axes, "axes of a universal joint", (2, 3))
         pairs = {"stiffness": stiffness, "damping": damping, "rest_angles": rest_angles}
-        values = {name: _pair(value, f"{name} of a universal joint") for name, value in pairs.items()}
+        values = {name: _checked_pair(value, f"{name} of a universal joint") for name, value in pairs.items()}
         self.coordinates = tuple(
-            _coordinate(
+            _make_joint_coordinate(
                 directions[i],
                 False,
                 values["stiffness"][i],
@@ -172,19 +176,21 @@ MIN_AXES_SINE = 1e-8
 """Least sine of the angle between the axes of a universal joint: the rounding of directions given to eight digits."""
 
 
-def _coordinate(axis, slides: bool, stiffness, rest, damping, joint: str, rest_name: str) -> JointCoordinate:
-    direction = checked_finite(axis, f"axis of {joint}", 3)
+def _make_joint_coordinate(
+    axis, slides: bool, stiffness, rest, damping, joint_text: str, rest_name: str
+) -> JointCoordinate:
+    direction = checked_finite(axis, f"axis of {joint_text}", 3)
     require_condition(
         direction,
         lambda a: jnp.any(a != 0.0),
-        f"the axis of {joint} must be a direction, not zero, got {{value}}. Give one such as (0, 0, 1)",
+        f"the axis of {joint_text} must be a direction, not zero, got {{value}}. Give one such as (0, 0, 1)",
     )
     return JointCoordinate(
         direction / jnp.linalg.norm(direction),
         slides,
-        _checked_coefficient(stiffness, f"stiffness of {joint}"),
-        checked_finite(checked_numbers(rest, f"{rest_name} of {joint}", ()), f"{rest_name} of {joint}"),
-        _checked_coefficient(damping, f"damping of {joint}"),
+        _checked_coefficient(stiffness, f"stiffness of {joint_text}"),
+        checked_finite(checked_numbers(rest, f"{rest_name} of {joint_text}", ()), f"{rest_name} of {joint_text}"),
+        _checked_coefficient(damping, f"damping of {joint_text}"),
     )
 
 
@@ -194,12 +200,12 @@ def _checked_coefficient(value, name: str) -> jax.Array:
     return number
 
 
-def _pair(value, name: str) -> jax.Array:
+def _checked_pair(value, name: str) -> jax.Array:
     return jnp.broadcast_to(checked_numbers(value, name, (), (2,)), (2,))
 
 
-def _checked_motor(motor: Any, joint: str) -> Callable | jax.Array | None:
-    """Return a motor as a function or an array; None if there is none."""
+def _checked_motor(motor: Any, joint_text: str) -> Callable | jax.Array | None:
+    """Return a motor as a function of time or as a finite array; None if the joint has no motor."""
     if motor is None or callable(motor):
         return motor
-    return checked_finite(np.atleast_1d(motor), f"motor of {joint}")
+    return checked_finite(np.atleast_1d(motor), f"motor of {joint_text}")

@@ -24,7 +24,7 @@ KEPLER_ITERATIONS = 6
 
 
 class Orbit(Module):
-    """A Kepler orbit about a centre of mass M, as a function of time to the position in axes in space.
+    """A Kepler orbit about a mass M: a function from time to the position in axes in space.
 
     Parameters
     ----------
@@ -54,18 +54,18 @@ class Orbit(Module):
         self.mean_motion = checked_positive(mean_motion, "mean_motion")
         self.radius = None if radius is None else checked_positive(radius, "radius")
         self.eccentricity, self.anomaly = checked_eccentricity(eccentricity), checked_numbers(anomaly, "anomaly", ())
-        self.towards, self.normal = checked_perpendicular(towards, normal)
+        self.towards, self.normal = checked_orbit_directions(towards, normal)
 
     def __call__(self, t) -> jax.Array:
         """Return the position relative to the centre at time t, shape (3,) (m)."""
         if self.radius is None:
             raise InputError("the orbit needs its radius (m): lt.torques.Orbit(mean_motion, radius=...)")
-        direction, distance = direction_and_distance(self, t)
+        direction, distance = direction_and_distance_to_centre(self, t)
         return -self.radius * distance * direction
 
 
-def direction_and_distance(orbit, t) -> tuple[jax.Array, jax.Array]:
-    """Return the unit vector to the centre in axes in space, shape (3,), and the distance r / a from it, at time t.
+def direction_and_distance_to_centre(orbit, t) -> tuple[jax.Array, jax.Array]:
+    """Return the unit vector from a body on an orbit to the centre, shape (3,), and the distance r / a, at time t.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def direction_and_distance(orbit, t) -> tuple[jax.Array, jax.Array]:
 
 
 def eccentric_anomaly(mean_anomaly, eccentricity) -> jax.Array:
-    """Return E with ``E - e sin E = M`` up to full turns, from -pi to pi [Danby, Celest. Mech. 40 (1987) 303]."""
+    """Solve Kepler's equation ``E - e sin E = M`` for E in [-pi, pi] [Danby, Celest. Mech. 40 (1987) 303]."""
     turn = 2.0 * jnp.pi
     M = mean_anomaly - turn * jnp.round(mean_anomaly / turn)
     e = eccentricity
@@ -103,7 +103,7 @@ def eccentric_anomaly(mean_anomaly, eccentricity) -> jax.Array:
 
 
 class DipoleField(Module):
-    """The magnetic field of a dipole at the centre of an orbit, as a function of time to B in axes in space.
+    """The magnetic field of a dipole at the centre of an orbit: a function from time to B in axes in space.
 
     ``B = (3 (k . r) r / r**2 - k) / r**3`` with the position r. For a dipole moment m it is ``k = mu_0 m / (4 pi)``;
     for the earth |k| is about 7.8e15 T m^3, and k points south.
@@ -133,35 +133,35 @@ class DipoleField(Module):
         self.rotation = checked_finite(rotation, "rotation", 3)
 
     def __call__(self, t) -> jax.Array:
-        r, k = self.orbit(t), rotate(self.strength, self.rotation * t)
+        r, k = self.orbit(t), rotate_by_vector(self.strength, self.rotation * t)
         r_squared = jnp.dot(r, r)
         return (3.0 * jnp.dot(k, r) / r_squared * r - k) / (r_squared * jnp.sqrt(r_squared))
 
 
-def rotate(vector, angle) -> jax.Array:
-    """Return a vector rotated by a rotation vector, shape (3,), whose derivatives exist at zero."""
-    return mf.SO(3).exp(angle) @ vector
+def rotate_by_vector(vector, rotation_vector) -> jax.Array:
+    """Rotate a vector, shape (3,), by a rotation vector; derivatives by the rotation vector exist at zero."""
+    return mf.SO(3).exp(rotation_vector) @ vector
 
 
 def checked_eccentricity(value) -> jax.Array:
-    """Return an eccentricity of an ellipse as an array."""
+    """Return the eccentricity of an ellipse as an array, after checking that it is in [0, 1)."""
     e = checked_numbers(value, "eccentricity", ())
     require_condition(e, lambda v: (v >= 0.0) & (v < 1.0), "eccentricity must be at least 0 and below 1, got {value}")
     return e
 
 
 def unit_vector(value, name: str) -> jax.Array:
-    """Return a direction with length 1."""
+    """Return a vector divided by its length, shape (3,), after checking that it is not zero."""
     array = checked_finite(value, name, 3)
     require_condition(array, lambda v: (v**2).sum() > 0.0, name + " must be a direction, not zero, got {value}")
     return array / jnp.sqrt(jnp.sum(array**2))
 
 
-def checked_perpendicular(towards, normal) -> tuple[jax.Array, jax.Array]:
-    """Return the directions to the centre and of the angular momentum of an orbit, of length 1."""
-    first, second = unit_vector(towards, "towards"), unit_vector(normal, "normal")
-    if not is_traced((first, second)):
-        cosine = float(np.dot(first, second))
+def checked_orbit_directions(towards, normal) -> tuple[jax.Array, jax.Array]:
+    """Return the unit vectors to the centre and along the angular momentum of an orbit, which must be perpendicular."""
+    towards_unit, normal_unit = unit_vector(towards, "towards"), unit_vector(normal, "normal")
+    if not is_traced((towards_unit, normal_unit)):
+        cosine = float(np.dot(towards_unit, normal_unit))
         if abs(cosine) > MAX_PERPENDICULAR_COSINE:
             raise InputError(f"towards and normal must be perpendicular, but their cosine is {cosine:.3g}")
-    return first, second
+    return towards_unit, normal_unit

@@ -10,14 +10,14 @@ from ..functions.conditions import checked_numbers, require_condition
 
 
 def checked_positive(value, name: str, count: int | None = None) -> jax.Array:
-    """Return a positive number, or ``count`` of them, as an array; traced values are returned as they are."""
+    """Return a positive number, or ``count`` positive numbers, as an array; traced values are returned unchanged."""
     array = checked_numbers(value, name, () if count is None else (count,))
     require_condition(array, lambda a: (a > 0.0) & (a < jnp.inf), name + " must be positive and finite, got {value}")
     return array
 
 
 def checked_finite(value, name: str, count: int | None = None) -> jax.Array:
-    """Return finite numbers as an array, of shape (count,) if ``count`` is given."""
+    """Return finite numbers as an array, of shape (count,) if a count is given."""
     array = checked_numbers(value, name, *(() if count is None else ((count,),)))
     require_condition(array, lambda a: abs(a) < jnp.inf, name + " must be finite, got {value}")
     return array
@@ -30,7 +30,7 @@ def checked_positive_vector(value, name: str) -> jax.Array:
 
 
 def checked_integer(value, name: str, minimum: int = 1) -> int:
-    """Return an integer that is at least ``minimum``."""
+    """Return a value after checking that it is an integer >= ``minimum``."""
     if isinstance(value, bool) or not isinstance(value, int) or value < minimum:
         raise InputError(f"{name} must be an integer >= {minimum}, got {value!r}")
     return value

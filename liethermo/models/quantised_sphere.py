@@ -73,15 +73,17 @@ class QuantisedSphere:
     # -- the Laplacian ------------------------------------------------------------------------------------------------
 
     def laplacian(self, mu) -> jax.Array:
-        """Return the state of ``Delta W``, shape (..., N^2 - 1)."""
-        return self._map_diagonals(mu, self._apply_tridiagonal)
+        """Return the state of the Laplacian ``Delta W`` of a vorticity, shape (..., N^2 - 1)."""
+        return self._apply_to_diagonals(mu, self._apply_tridiagonal)
 
     def inverse_laplacian(self, mu) -> jax.Array:
-        """Return the state of the traceless P with ``Delta P = W``, shape (..., N^2 - 1)."""
-        return self._map_diagonals(mu, self._solve_tridiagonal)
+        """Solve ``Delta P = W`` and return the state of the traceless P, shape (..., N^2 - 1)."""
+        return self._apply_to_diagonals(mu, self._solve_tridiagonal)
 
-    def _map_diagonals(self, mu, function) -> jax.Array:
-        """Apply a function to the main and upper diagonals, shape (N, 2, N): entry i of diagonal m at [i, :, m]."""
+    def _apply_to_diagonals(self, mu, function) -> jax.Array:
+        """Apply a function to the main and upper diagonals of a state, and return the state of the result.
+
+        The function maps arrays of shape (..., N, 2, N), with entry i of diagonal m at [..., i, :, m]."""
         entry_sources, entry_factors, component_sources, component_factors = self._diagonal_index_tables
         tables = self.algebra.matrix_basis
         diagonal = tables.diagonal
@@ -95,7 +97,7 @@ class QuantisedSphere:
 
     @cached_property
     def _diagonal_index_tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Index tables: the component and factor of each entry [i, :, m]; the entry and factor of each component.
+        """Index tables between the components of a state and the entries [i, :, m] of the diagonals, with factors.
 
         The entries of the diagonals below are those above with the sign of an anti-Hermitian matrix, so that they have
         the same products with the basis. What stands on the main diagonal follows the components, or the entries.
@@ -120,16 +122,16 @@ class QuantisedSphere:
         )
         return entry_sources, entry_factors, component_sources, component_factors
 
-    def _apply_tridiagonal(self, rows) -> jax.Array:
+    def _apply_tridiagonal(self, diagonals) -> jax.Array:
         main, off_diagonal = self._tridiagonal_coefficients
-        up = jnp.pad(rows[..., 1:, :, :], [(0, 0)] * (rows.ndim - 3) + [(0, 1), (0, 0), (0, 0)])
-        down = jnp.pad(rows[..., :-1, :, :], [(0, 0)] * (rows.ndim - 3) + [(1, 0), (0, 0), (0, 0)])
+        up = jnp.pad(diagonals[..., 1:, :, :], [(0, 0)] * (diagonals.ndim - 3) + [(0, 1), (0, 0), (0, 0)])
+        down = jnp.pad(diagonals[..., :-1, :, :], [(0, 0)] * (diagonals.ndim - 3) + [(1, 0), (0, 0), (0, 0)])
         lower_diagonal = np.pad(off_diagonal[:-1], [(1, 0), (0, 0)])
-        return -(main[:, None] * rows + off_diagonal[:, None] * up + lower_diagonal[:, None] * down)
+        return -(main[:, None] * diagonals + off_diagonal[:, None] * up + lower_diagonal[:, None] * down)
 
-    def _solve_tridiagonal(self, rows) -> jax.Array:
+    def _solve_tridiagonal(self, diagonals) -> jax.Array:
         ratio, inverse = self._ldl_factors
-        rows = jnp.moveaxis(-rows, -3, 0)  # the scans run along all diagonals at once
+        diagonals = jnp.moveaxis(-diagonals, -3, 0)  # the scans run along all diagonals at once
 
         def eliminate(previous_row, row_and_factor):
             row, factor = row_and_factor
@@ -141,23 +143,23 @@ class QuantisedSphere:
             solved_row = row - factor * next_row
             return solved_row, solved_row
 
-        start = jnp.zeros(rows.shape[1:])
-        _, rows = jax.lax.scan(eliminate, start, (rows, np.pad(ratio[:-1], [(1, 0), (0, 0)])))
-        scaled_rows = rows * inverse.reshape(self.N, *[1] * (rows.ndim - 2), self.N)
-        _, rows = jax.lax.scan(substitute, start, (scaled_rows, ratio), reverse=True)
-        rows = jnp.moveaxis(rows, 0, -3)
-        mean = jnp.mean(rows[..., 0], axis=-2, keepdims=True)  # the main diagonal is known up to a multiple of 1
-        return rows.at[..., 0].add(-mean)
+        start = jnp.zeros(diagonals.shape[1:])
+        _, diagonals = jax.lax.scan(eliminate, start, (diagonals, np.pad(ratio[:-1], [(1, 0), (0, 0)])))
+        scaled_rows = diagonals * inverse.reshape(self.N, *[1] * (diagonals.ndim - 2), self.N)
+        _, diagonals = jax.lax.scan(substitute, start, (scaled_rows, ratio), reverse=True)
+        diagonals = jnp.moveaxis(diagonals, 0, -3)
+        mean = jnp.mean(diagonals[..., 0], axis=-2, keepdims=True)  # the main diagonal is known up to a multiple of 1
+        return diagonals.at[..., 0].add(-mean)
 
     @cached_property
     def _entry_mask(self) -> np.ndarray:
-        """The array that is 1 at the existing entries [i, m] of the diagonals, ``i + m < N``, and 0 elsewhere."""
+        """Array that is 1 at the entries [i, m] that diagonals have, ``i + m < N``, and 0 elsewhere."""
         i, m = np.indices((self.N, self.N))
         return (i + m < self.N).astype(np.float64)
 
     @cached_property
     def _tridiagonal_coefficients(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the diagonal and the coupling of entry i to i + 1 of minus the Laplacian, shapes (N, N) as [i, m]."""
+        """Diagonal and off-diagonal entries of minus the Laplacian of each diagonal m, shapes (N, N) as [i, m]."""
         N, s = self.N, (self.N - 1) / 2.0
         i, m = np.indices((N, N))
         z = s - np.arange(N)  # eigenvalues of S_z
@@ -186,7 +188,7 @@ class QuantisedSphere:
     # -- matrices and spherical harmonics -----------------------------------------------------------------------------
 
     def state(self, vorticity) -> jax.Array:
-        """Return the state of a vorticity matrix, shape (N, N), that is anti-Hermitian and traceless.
+        """Return the state of an anti-Hermitian, traceless vorticity matrix, shape (N, N).
 
         Raises
         ------

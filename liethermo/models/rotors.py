@@ -60,7 +60,7 @@ class BearingFriction(Damping):
 
 
 class RotorFriction(Damping):
-    """Friction inside the rotor: the double bracket in the axes of the rotor.
+    """Friction inside the rotor: a double bracket in the axes of the rotor.
 
     ``L' = L × sigma, p' = a . (L × sigma)`` with ``sigma = rate L × (Omega + w a)`` damps the motion of L in the
     rotor's axes, and ``H' = -rate |L × (Omega + w a)|**2``. With a = 0 it is friction inside the platform.
@@ -346,7 +346,7 @@ def _rotor_system(inertia, axes, rotors, make_dissipation, baths, attitude, torq
 
 
 def _unit_axes(axes) -> jax.Array:
-    """Return directions, shape (3,) or (k, 3), as unit vectors in columns, shape (3, k)."""
+    """Normalise directions, shape (3,) or (k, 3), and return them as columns, shape (3, k)."""
     checked_numbers(axes, "axis")
     directions = np.atleast_2d(np.asarray(axes, dtype=float))
     if directions.ndim != 2 or directions.shape[1] != 3 or not np.isfinite(directions).all():

@@ -25,7 +25,7 @@ from ..functions.conditions import checked_numbers, require_condition
 from ..functions.time_span import FunctionWithBreaks, Table, TableKind, kinks_of_table
 from ..functions.time_span import PiecewiseConstant as FunctionPiecewiseConstant
 from .inertia import checked_inertia
-from .orbits import DipoleField, Orbit, direction_and_distance, unit_vector
+from .orbits import DipoleField, Orbit, direction_and_distance_to_centre, unit_vector
 from .parameters import checked_finite, checked_positive
 
 __all__ = [
@@ -143,9 +143,9 @@ class GravityGradient(Module):
         return self._direction_and_distance(t)[0]
 
     def _direction_and_distance(self, t) -> tuple[jax.Array, Any]:
-        """Return the unit vector to the centre, shape (3,), and the distance r / a from it."""
+        """Return the unit vector to the centre of the orbit, shape (3,), and the distance r / a, at time t."""
         if self.eccentricity is not None:
-            return direction_and_distance(self, t)
+            return direction_and_distance_to_centre(self, t)
         angle = self.mean_motion * t
         return jnp.cos(angle) * self.towards + jnp.sin(angle) * jnp.cross(self.normal, self.towards), 1.0
 
@@ -179,7 +179,7 @@ class BDot(Module):
     ``tau = m × B``, with ``dB/dt = g^T B'(t) - Omega × B`` in body axes [Stickler & Alfriend, J. Spacecraft 13 (1976)
     282]. In a field that is constant in space, ``tau = -k |B|^2`` times the part of Omega normal to B: a torque from
     outside that takes energy from the body. The work of the ledger falls by this energy, and energy less work is
-    constant. The heat is that of the coils and of the source of the field, which are no part of the system.
+    constant. The heat is that of the coils and of the source of the field, which are not part of the system.
 
     Parameters
     ----------
@@ -300,11 +300,11 @@ class SolarPressurePlates(Module):
         self.pressure = pressure if callable(pressure) else checked_numbers(pressure, "pressure", ())
 
     def __call__(self, t, mu, attitude):
-        u = attitude.T @ _direction(self.sun, t)
+        u = attitude.T @ _unit_vector_at_time(self.sun, t)
         cosine = jnp.maximum(self.normals @ u, 0.0)
         along_normal = 2.0 * (self.specular * cosine + self.diffuse / 3.0)
         unit_forces = (1.0 - self.specular)[:, None] * u + along_normal[:, None] * self.normals
-        forces = -_value(self.pressure, t) * (self.areas * cosine)[:, None] * unit_forces
+        forces = -_evaluate_at_time(self.pressure, t) * (self.areas * cosine)[:, None] * unit_forces
         return jnp.sum(jnp.cross(self.centres, forces), axis=0)
 
 
@@ -338,7 +338,12 @@ class SolarPressureSphere(Module):
         self.pressure = pressure if callable(pressure) else checked_numbers(pressure, "pressure", ())
 
     def __call__(self, t, mu, attitude):
-        force = -_value(self.pressure, t) * self.coefficient * self.area * (attitude.T @ _direction(self.sun, t))
+        force = (
+            -_evaluate_at_time(self.pressure, t)
+            * self.coefficient
+            * self.area
+            * (attitude.T @ _unit_vector_at_time(self.sun, t))
+        )
         return jnp.cross(self.centre, force)
 
 
@@ -372,7 +377,7 @@ class Thrusters(Module):
 
     def __call__(self, t, mu):
         moments = jnp.cross(self.positions, self.forces)
-        return jnp.atleast_1d(_value(self.levels, t)) @ moments
+        return jnp.atleast_1d(_evaluate_at_time(self.levels, t)) @ moments
 
 
 class Motor(Module):
@@ -477,13 +482,13 @@ class Tabulated(FunctionWithBreaks):
         return Table.from_parts(self.times, self.moments, self.coefficients)(t)
 
 
-def _value(quantity, t) -> jax.Array:
-    """Return a number, or a function of time at the time t."""
+def _evaluate_at_time(quantity, t) -> jax.Array:
+    """Return the value of a quantity at time t, from a constant or a function of time."""
     return quantity(t) if callable(quantity) else quantity
 
 
-def _direction(quantity, t) -> jax.Array:
-    """Return a unit vector: a constant one, or that of a function of time."""
+def _unit_vector_at_time(quantity, t) -> jax.Array:
+    """Return a unit vector at time t, from a constant unit vector or a function of time."""
     if not callable(quantity):
         return quantity
     vector = quantity(t)

@@ -18,10 +18,10 @@ from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers
 from ..systems import HeatBaths
 from ..tracing.programs import jit_unoptimised
-from ..tracing.short_form import join_shown
+from ..tracing.short_form import join_first_items
 from .articulated_bodies import ArticulatedBodies, JointSprings
 from .bodies_on_ground import BodiesOnGround
-from .inertia import INEQUALITY_RTOL, is_symmetric, satisfies_triangle_inequalities
+from .inertia import INEQUALITY_RTOL, are_symmetric_to_rounding, satisfies_triangle_inequalities
 from .joint_states import JointMotors, JointRange
 from .jointed_bodies import JointedBodies
 from .joints import Joint, JointCoordinate
@@ -146,8 +146,8 @@ class Tree(metaclass=ListedType):
             raise InputError(f"{name!r} is the first body, so it is the base, which has no parent and no joint")
         if self._bodies:
             if parent is None or joint is None:
-                missing = "a parent" if parent is None else "a joint"
-                raise InputError(f"{name!r} needs {missing}: only the base, {self.base!r}, has none")
+                missing_argument = "a parent" if parent is None else "a joint"
+                raise InputError(f"{name!r} needs {missing_argument}: only the base, {self.base!r}, has none")
             if parent not in self._bodies:
                 names = ", ".join(map(repr, self._bodies))
                 raise InputError(
@@ -176,7 +176,7 @@ class Tree(metaclass=ListedType):
         return next(iter(self._bodies))
 
     def __repr__(self) -> str:
-        return f"Tree({join_shown(self._bodies, ('', ''))})"
+        return f"Tree({join_first_items(self._bodies, ('', ''))})"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -217,20 +217,22 @@ class Tree(metaclass=ListedType):
         if gravity is not None and not isinstance(gravity, Orbit):
             gravity = checked_finite(gravity, "gravity", 3)
         base = self._bodies[self.base]
-        moved = [body for body in self._bodies.values() if body.joint is not None]
-        if not moved:
+        moved_bodies = [body for body in self._bodies.values() if body.joint is not None]
+        if not moved_bodies:
             raise InputError(
                 f"the tree has one body, {base.name!r}, and no joint. Add bodies, or use lt.LiePoissonSystem with "
                 "lt.Quadratic for one rigid body"
             )
-        layout = _layout(base, moved, self._has_ground)
-        first = layout.mechanism.first_joint_index
-        ranges = tuple((name, first + start, first + end) for name, start, end in layout.joint_ranges)
-        if not is_traced(layout.mechanism):
-            _check_pivots(layout.mechanism, layout.joint_ranges)
-        joint_motors = _joint_motors(moved, motors, layout)
+        tree_arrays = _make_tree_arrays(base, moved_bodies, self._has_ground)
+        first_joint_index = tree_arrays.mechanism.first_joint_index
+        ranges = tuple(
+            (name, first_joint_index + start, first_joint_index + end) for name, start, end in tree_arrays.joint_ranges
+        )
+        if not is_traced(tree_arrays.mechanism):
+            _check_joints_move_inertia(tree_arrays.mechanism, tree_arrays.joint_ranges)
+        joint_motors = _make_joint_motors(moved_bodies, motors, tree_arrays)
         if not self._has_ground:
-            bodies = layout.mechanism, layout.springs, layout.damping, ranges
+            bodies = tree_arrays.mechanism, tree_arrays.springs, tree_arrays.damping, ranges
             return JointedBodies(*bodies, baths, torque, joint_motors, attitude, gravity)
         if torque is not None:
             raise InputError(
@@ -240,7 +242,9 @@ class Tree(metaclass=ListedType):
             raise InputError(
                 "gravity along an orbit is for a free tree; on the ground give a field, such as (0, 0, -9.81)"
             )
-        return BodiesOnGround(layout.mechanism, layout.springs, layout.damping, ranges, baths, joint_motors, gravity)
+        return BodiesOnGround(
+            tree_arrays.mechanism, tree_arrays.springs, tree_arrays.damping, ranges, baths, joint_motors, gravity
+        )
 
     @classmethod
     def from_urdf(cls, source: str | os.PathLike, fixed_base: bool = False) -> Tree:
@@ -276,7 +280,7 @@ class Tree(metaclass=ListedType):
         >>> tree.names
         ('bus', 'panel')
         """
-        return _tree_of(cls, read_urdf(source, fixed_base), fixed_base)
+        return _tree_from_records(cls, read_urdf(source, fixed_base), fixed_base)
 
     @classmethod
     def from_mjcf(cls, source: str | os.PathLike) -> Tree:
@@ -309,7 +313,7 @@ class Tree(metaclass=ListedType):
         >>> tree.names
         ('bus', 'panel')
         """
-        return _tree_of(cls, *read_mjcf(source))
+        return _tree_from_records(cls, *read_mjcf(source))
 
 
 def _checked_name(name: str) -> str:
@@ -318,8 +322,8 @@ def _checked_name(name: str) -> str:
     return name
 
 
-def _tree_of(cls: type[Tree], records: Sequence[BodyRecord], has_ground: bool) -> Tree:
-    """Return a tree with the bodies of a file, of which the first one is the base."""
+def _tree_from_records(cls: type[Tree], records: Sequence[BodyRecord], has_ground: bool) -> Tree:
+    """Return a tree made of body records, of which the first is the base or the ground."""
     tree = cls(records[0].name if has_ground else None)
     for record in records[1:] if has_ground else records:
         tree.add(*record)
@@ -327,34 +331,34 @@ def _tree_of(cls: type[Tree], records: Sequence[BodyRecord], has_ground: bool) -
 
 
 def _checked_body_inertia(inertia, name: str) -> jax.Array:
-    """Return the tensor of inertia of a rigid body, shape (3, 3); points and slender rods are allowed.
+    """Return the tensor of inertia of a rigid body, shape (3, 3), after checking it; points and rods are allowed.
 
     Raises
     ------
     InputError
         If a tensor is not symmetric, a moment is negative, or one is more than the sum of the other two.
     """
-    what = f"the inertia of {name!r}"
-    array = checked_finite(checked_numbers(inertia, what, (3,), (3, 3)), what)
+    inertia_text = f"the inertia of {name!r}"
+    array = checked_finite(checked_numbers(inertia, inertia_text, (3,), (3, 3)), inertia_text)
     if is_traced(array):
         return jnp.diag(array) if array.ndim == 1 else 0.5 * (array + array.T)
     tensor = np.diag(array) if array.ndim == 1 else np.asarray(array)
-    if not is_symmetric(tensor):
-        raise InputError(f"{what} must be a symmetric tensor, got {tensor.tolist()}")
+    if not are_symmetric_to_rounding(tensor):
+        raise InputError(f"{inertia_text} must be a symmetric tensor, got {tensor.tolist()}")
     tensor = 0.5 * (tensor + tensor.T)
     moments = np.linalg.eigvalsh(tensor)
     if moments[0] < -INEQUALITY_RTOL * abs(moments).max():
-        raise InputError(f"{what} must have principal moments >= 0, got {moments.tolist()}")
+        raise InputError(f"{inertia_text} must have principal moments >= 0, got {moments.tolist()}")
     if not satisfies_triangle_inequalities(moments):
         raise InputError(
-            f"no rigid body has {what}: its largest principal moment, {moments[2]:g}, is more than the sum of the "
-            f"others, {moments[0] + moments[1]:g}. Check that it is about the centre of mass"
+            f"no rigid body has {inertia_text}: its largest principal moment, {moments[2]:g}, is more than the "
+            f"sum of the others, {moments[0] + moments[1]:g}. Check that it is about the centre of mass"
         )
     return jnp.asarray(tensor)
 
 
-class _Layout(NamedTuple):
-    """Arrays of a tree.
+class _TreeArrays(NamedTuple):
+    """The mechanism, springs, dampers and joint ranges of a tree, as arrays.
 
     Attributes
     ----------
@@ -371,32 +375,32 @@ class _Layout(NamedTuple):
     joint_ranges: list[JointRange]
 
 
-def _layout(base: _Body, moved: list[_Body], has_ground: bool) -> _Layout:
-    """Return the arrays of a tree; each coordinate of a joint moves a link, the last one that of the body."""
-    link_of = {base.name: 0}
+def _make_tree_arrays(base: _Body, moved_bodies: list[_Body], has_ground: bool) -> _TreeArrays:
+    """Make the arrays of a tree; each joint coordinate moves one link, and the last one moves that of the body."""
+    link_by_body = {base.name: 0}
     parents: list[int] = []
-    places: list[jax.Array] = []
+    joint_positions: list[jax.Array] = []
     joint_ranges: list[JointRange] = []
     coordinates: list[JointCoordinate] = []
-    for body in moved:
+    for body in moved_bodies:
         assert body.joint is not None
         assert body.parent is not None
-        link, place = link_of[body.parent], body.joint.at
+        link, joint_position = link_by_body[body.parent], body.joint.at
         for coordinate in body.joint.coordinates:
             parents.append(link)
-            places.append(place)
+            joint_positions.append(joint_position)
             coordinates.append(coordinate)
-            link, place = len(parents), jnp.zeros(3)
-        link_of[body.name] = link
+            link, joint_position = len(parents), jnp.zeros(3)
+        link_by_body[body.name] = link
         joint_ranges.append((body.name, link - body.joint.size, link))
-    bodies = moved if has_ground else [base, *moved]
+    bodies = moved_bodies if has_ground else [base, *moved_bodies]
     mechanism = ArticulatedBodies(
         jnp.stack([body.mass for body in bodies]),
         jnp.stack([body.centre for body in bodies]),
         jnp.stack([body.inertia for body in bodies]),
-        jnp.stack(places),
+        jnp.stack(joint_positions),
         jnp.stack([coordinate.axis for coordinate in coordinates]),
-        tuple(link_of[body.name] for body in bodies),
+        tuple(link_by_body[body.name] for body in bodies),
         tuple(parents),
         tuple(coordinate.slides for coordinate in coordinates),
         has_ground,
@@ -406,26 +410,26 @@ def _layout(base: _Body, moved: list[_Body], has_ground: bool) -> _Layout:
         jnp.stack([coordinate.rest for coordinate in coordinates]),
         mechanism.first_joint_index,
     )
-    return _Layout(mechanism, springs, jnp.stack([coordinate.damping for coordinate in coordinates]), joint_ranges)
+    return _TreeArrays(mechanism, springs, jnp.stack([coordinate.damping for coordinate in coordinates]), joint_ranges)
 
 
 @jit_unoptimised
-def _pivots_and_mass_matrix(mechanism: ArticulatedBodies, q) -> tuple[jax.Array, jax.Array]:
-    return mechanism.pivots(q), mechanism.mass_matrix(q)
+def _joint_inertias_and_mass_matrix(mechanism: ArticulatedBodies, q) -> tuple[jax.Array, jax.Array]:
+    return mechanism.articulated_joint_inertias(q), mechanism.mass_matrix(q)
 
 
-def _check_pivots(mechanism: ArticulatedBodies, joint_ranges: list[JointRange]) -> None:
-    """Raise InputError if a joint moves no inertia, or the whole has none about an axis, at a random configuration."""
+def _check_joints_move_inertia(mechanism: ArticulatedBodies, joint_ranges: list[JointRange]) -> None:
+    """Raise InputError if a joint moves no inertia, or the tree has none about an axis, at random joint coordinates."""
     q = np.random.default_rng(TEST_ANGLES_SEED).uniform(0.5, 1.0, mechanism.n_joints)
     with jax.ensure_compile_time_eval():
-        pivots, M = map(np.asarray, _pivots_and_mass_matrix(mechanism, jnp.asarray(q)))
-    first = mechanism.first_joint_index
-    scales = np.diagonal(M)[first:]
-    inertia_scale = np.diagonal(M)[:first].max(initial=scales.max())
+        joint_inertias, M = map(np.asarray, _joint_inertias_and_mass_matrix(mechanism, jnp.asarray(q)))
+    n_base_velocities = mechanism.first_joint_index
+    scales = np.diagonal(M)[n_base_velocities:]
+    inertia_scale = np.diagonal(M)[:n_base_velocities].max(initial=scales.max())
     for name, start, end in joint_ranges:
         for i in range(start, end):
             scale = np.sum(mechanism.masses) if mechanism.slides[i] else max(scales[i], inertia_scale)
-            if not pivots[i] > MIN_PIVOT_FRACTION * scale:
+            if not joint_inertias[i] > MIN_PIVOT_FRACTION * scale:
                 raise InputError(
                     f"the joint of {name!r} moves no inertia, so its motion is undefined. Give the body an inertia, or "
                     "a centre of mass off the axis"
@@ -440,30 +444,34 @@ def _check_pivots(mechanism: ArticulatedBodies, joint_ranges: list[JointRange]) 
         )
 
 
-def _joint_motors(moved: list[_Body], given: Mapping[str, Any] | None, layout: _Layout) -> JointMotors | None:
-    """Return the motors of a tree, checked and traced; None if there is none."""
-    if not isinstance(given, Mapping | None):
-        raise InputError(f"motors must be a dict by the names of bodies, got {type(given).__name__}")
-    names = [body.name for body in moved]
-    if unknown := [name for name in given or {} if name not in names]:
+def _make_joint_motors(
+    moved_bodies: list[_Body], motors: Mapping[str, Any] | None, tree_arrays: _TreeArrays
+) -> JointMotors | None:
+    """Return the motors in the joints of a tree, checked and traced; None if no joint has a motor."""
+    if not isinstance(motors, Mapping | None):
+        raise InputError(f"motors must be a dict by the names of bodies, got {type(motors).__name__}")
+    names = [body.name for body in moved_bodies]
+    if unknown := [name for name in motors or {} if name not in names]:
         raise InputError(f"no joint moves {', '.join(map(repr, unknown))}. The joints move {', '.join(names)}")
-    by_name = {body.name: body.joint.motor for body in moved if body.joint is not None} | dict(given or {})
-    functions, indices, driven = [], [], []
-    for name, start, end in layout.joint_ranges:
-        if (motor := by_name[name]) is None:
+    motor_by_body = {body.name: body.joint.motor for body in moved_bodies if body.joint is not None} | dict(
+        motors or {}
+    )
+    functions, indices, driven_bodies = [], [], []
+    for name, start, end in tree_arrays.joint_ranges:
+        if (motor := motor_by_body[name]) is None:
             continue
-        size, what = end - start, f"the motor of {name!r}"
-        allowed_shapes = ((size,), ()) if size == 1 else ((size,),)
+        n_coordinates, motor_text = end - start, f"the motor of {name!r}"
+        allowed_shapes = ((n_coordinates,), ()) if n_coordinates == 1 else ((n_coordinates,),)
         if callable(motor):
-            motor, _ = traced_function_and_shape(motor, [()], allowed_shapes, what, "a time t")
+            motor, _ = traced_function_and_shape(motor, [()], allowed_shapes, motor_text, "a time t")
         else:
-            motor = checked_finite(np.atleast_1d(motor) if not is_traced(motor) else motor, what)
+            motor = checked_finite(np.atleast_1d(motor) if not is_traced(motor) else motor, motor_text)
             if motor.shape not in allowed_shapes:
-                wanted = "one number" if size == 1 else f"an array of shape ({size},)"
-                raise FunctionError(f"{what} must be {wanted}, got an array of shape {motor.shape}")
+                shape_text = "one number" if n_coordinates == 1 else f"an array of shape ({n_coordinates},)"
+                raise FunctionError(f"{motor_text} must be {shape_text}, got an array of shape {motor.shape}")
         functions.append(motor)
         indices.append(tuple(range(start, end)))
-        driven.append(name)
+        driven_bodies.append(name)
     if not functions:
         return None
-    return JointMotors(tuple(functions), tuple(indices), layout.mechanism.n_joints, tuple(driven))
+    return JointMotors(tuple(functions), tuple(indices), tree_arrays.mechanism.n_joints, tuple(driven_bodies))

@@ -89,22 +89,22 @@ class LinkRecord(NamedTuple):
 
 
 def read_urdf(source: str | os.PathLike, fixed_base: bool = False) -> list[BodyRecord]:
-    """Return the bodies of a URDF file or text, from the base outwards; see :meth:`.Tree.from_urdf`.
+    """Read the bodies of a URDF file or text, in order from the base outwards; see :meth:`.Tree.from_urdf`.
 
     If the base is fixed, its mass is zero.
     """
-    robot = _read_root(source, "robot", "URDF")
-    _refuse_children(robot, "robot", {"link", "joint"}, URDF_SHAPES | {"transmission"})
-    links = {_attribute(link, "name"): link for link in robot.findall("link")}
+    robot = _read_xml_root(source, "robot", "URDF")
+    _refuse_unknown_children(robot, "robot", {"link", "joint"}, URDF_SHAPES | {"transmission"})
+    links = {_required_attribute(link, "name"): link for link in robot.findall("link")}
     joint_of: dict[str, Element] = {}
     for joint in robot.findall("joint"):
-        kind, name = _attribute(joint, "type"), _attribute(joint, "name")
+        kind, name = _required_attribute(joint, "type"), _required_attribute(joint, "name")
         if kind not in URDF_JOINTS:
             raise InputError(
                 f"the joint {name!r} is of type {kind!r}, which is not covered. The types that are: "
                 f"{', '.join(URDF_JOINTS)}"
             )
-        parent, child = (_attribute(_child(joint, tag), "link") for tag in ("parent", "child"))
+        parent, child = (_required_attribute(_only_child(joint, tag), "link") for tag in ("parent", "child"))
         for link in (parent, child):
             if link not in links:
                 raise InputError(f"the joint {name!r} names the link {link!r}, which the file does not have")
@@ -118,12 +118,16 @@ def read_urdf(source: str | os.PathLike, fixed_base: bool = False) -> list[BodyR
     names, records = roots, []
     while names:
         name, *names = names
-        records.append(_urdf_link(name, links[name], joint_of.get(name)))
-        names += [child for child, joint in joint_of.items() if _attribute(_child(joint, "parent"), "link") == name]
+        records.append(_read_urdf_link(name, links[name], joint_of.get(name)))
+        names += [
+            child
+            for child, joint in joint_of.items()
+            if _required_attribute(_only_child(joint, "parent"), "link") == name
+        ]
     if len(records) < len(links):
-        rest = sorted(set(links) - {record.name for record in records})
-        raise InputError(f"the links {', '.join(rest)} are in a loop of joints, so they are not a tree")
-    return _assemble(records, fixed_base)
+        unreached_links = sorted(set(links) - {record.name for record in records})
+        raise InputError(f"the links {', '.join(unreached_links)} are in a loop of joints, so they are not a tree")
+    return _merge_fixed_links(records, fixed_base)
 
 
 URDF_SHAPES = {"visual", "collision", "material"}
@@ -133,41 +137,44 @@ URDF_JOINTS = ("revolute", "continuous", "prismatic", "fixed")
 """Types of joints of URDF that are covered."""
 
 
-def _urdf_link(name: str, link: Element, joint: Element | None) -> LinkRecord:
-    _refuse_children(link, f"link {name!r}", {"inertial"}, URDF_SHAPES)
+def _read_urdf_link(name: str, link: Element, joint: Element | None) -> LinkRecord:
+    _refuse_unknown_children(link, f"link {name!r}", {"inertial"}, URDF_SHAPES)
     mass, centre, inertia = 0.0, np.zeros(3), np.zeros((3, 3))
     if (inertial := link.find("inertial")) is not None:
-        _refuse_children(inertial, f"inertial of {name!r}", {"origin", "mass", "inertia"}, set())
-        mass = _number(_child(inertial, "mass"), "value")
-        entries = {key: _number(_child(inertial, "inertia"), key) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")}
-        R, centre = _urdf_origin(inertial)
-        inertia = R @ _symmetric(*entries.values()) @ R.T
+        _refuse_unknown_children(inertial, f"inertial of {name!r}", {"origin", "mass", "inertia"}, set())
+        mass = _number_attribute(_only_child(inertial, "mass"), "value")
+        entries = {
+            key: _number_attribute(_only_child(inertial, "inertia"), key)
+            for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+        }
+        R, centre = _read_urdf_origin(inertial)
+        inertia = R @ _symmetric_matrix(*entries.values()) @ R.T
     if joint is None:
         return LinkRecord(name, None, np.eye(3), np.zeros(3), mass, centre, inertia, ())
-    joint_name, kind = _attribute(joint, "name"), _attribute(joint, "type")
+    joint_name, kind = _required_attribute(joint, "name"), _required_attribute(joint, "type")
     covered = {"parent", "child", "origin", "axis", "dynamics"}
-    _refuse_children(joint, f"joint {joint_name!r}", covered, {"limit", "calibration", "safety_controller"})
-    rotation, origin = _urdf_origin(joint)
+    _refuse_unknown_children(joint, f"joint {joint_name!r}", covered, {"limit", "calibration", "safety_controller"})
+    rotation, origin = _read_urdf_origin(joint)
     joints: tuple[JointRecord, ...] = ()
     if kind != "fixed":
         axis, dynamics = joint.find("axis"), joint.find("dynamics")
-        direction = np.array([1.0, 0.0, 0.0]) if axis is None else _numbers(axis, "xyz", 3)
+        direction = np.array([1.0, 0.0, 0.0]) if axis is None else _number_array_attribute(axis, "xyz", 3)
         damping = 0.0
         if dynamics is not None:
-            damping = _number(dynamics, "damping", 0.0)
-            _refuse_nonzero(dynamics, "friction", f"dynamics of the joint {joint_name!r}")
+            damping = _number_attribute(dynamics, "damping", 0.0)
+            _refuse_nonzero_attribute(dynamics, "friction", f"dynamics of the joint {joint_name!r}")
         joints = (JointRecord(kind == "prismatic", np.zeros(3), direction, 0.0, damping, 0.0),)
-    parent = _attribute(_child(joint, "parent"), "link")
+    parent = _required_attribute(_only_child(joint, "parent"), "link")
     return LinkRecord(name, parent, rotation, origin, mass, centre, inertia, joints)
 
 
-def _urdf_origin(element: Element) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rotation and the position of the ``origin`` of an element."""
+def _read_urdf_origin(element: Element) -> tuple[np.ndarray, np.ndarray]:
+    """Read the ``origin`` of a URDF element; return the rotation, shape (3, 3), and the position, shape (3,)."""
     origin = element.find("origin")
     if origin is None:
         return np.eye(3), np.zeros(3)
-    angles = _numbers(origin, "rpy", 3, np.zeros(3))
-    return Rotation.from_euler("xyz", angles).as_matrix(), _numbers(origin, "xyz", 3, np.zeros(3))
+    angles = _number_array_attribute(origin, "rpy", 3, np.zeros(3))
+    return Rotation.from_euler("xyz", angles).as_matrix(), _number_array_attribute(origin, "xyz", 3, np.zeros(3))
 
 
 GROUND_NAME = "world"
@@ -175,23 +182,23 @@ GROUND_NAME = "world"
 
 
 def read_mjcf(source: str | os.PathLike) -> tuple[list[BodyRecord], bool]:
-    """Return the bodies of an MJCF file or text, from the base outwards, and whether the base is the ground.
+    """Read the bodies of an MJCF file or text, in order from the base outwards, and True if the base is the ground.
 
     See :meth:`.Tree.from_mjcf`.
     """
-    root = _read_root(source, "mujoco", "MJCF")
+    root = _read_xml_root(source, "mujoco", "MJCF")
     covered = {"compiler", "option", "default", "worldbody"}
-    _refuse_children(root, "mujoco", covered, MJCF_SETTINGS)
+    _refuse_unknown_children(root, "mujoco", covered, MJCF_SETTINGS)
     for option in root.findall("option"):
         for name in ("density", "viscosity", "wind"):
-            _refuse_nonzero(option, name, "option")
+            _refuse_nonzero_attribute(option, name, "option")
     reader = _MjcfReader(root)
-    world = _child(root, "worldbody")
-    _refuse_children(world, "worldbody", {"body"}, MJCF_SHAPES)
+    world = _only_child(root, "worldbody")
+    _refuse_unknown_children(world, "worldbody", {"body"}, MJCF_SHAPES)
     bodies = world.findall("body")
     if not bodies:
         raise InputError("worldbody must have a body, got none")
-    has_ground = not any(_is_free(body) for body in bodies)
+    has_ground = not any(_has_free_joint(body) for body in bodies)
     if has_ground:
         zero = np.zeros(3)
         reader.records.append(LinkRecord(GROUND_NAME, None, np.eye(3), zero, 0.0, zero, np.zeros((3, 3)), ()))
@@ -199,11 +206,11 @@ def read_mjcf(source: str | os.PathLike) -> tuple[list[BodyRecord], bool]:
         raise InputError(f"a free base must be the only body of worldbody, got {len(bodies)} bodies")
     for body in bodies:
         reader.add_body(body, GROUND_NAME if has_ground else None)
-    return _assemble(reader.records, has_ground), has_ground
+    return _merge_fixed_links(reader.records, has_ground), has_ground
 
 
-def _is_free(body: Element) -> bool:
-    """Return whether a body of an MJCF file has a free joint."""
+def _has_free_joint(body: Element) -> bool:
+    """Return True if a body of an MJCF file has a free joint."""
     has_free_joint = any(joint.get("type") == "free" for joint in body.findall("joint"))
     return has_free_joint or body.find("freejoint") is not None
 
@@ -231,7 +238,7 @@ MJCF_ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 
 
 class _MjcfReader:
-    """The bodies of an MJCF file, with its units of angles and its defaults."""
+    """Reader of the bodies of an MJCF file, with the unit of angles and the joint defaults of the file."""
 
     def __init__(self, root: Element):
         self.records: list[LinkRecord] = []
@@ -247,19 +254,19 @@ class _MjcfReader:
             if compiler.get("inertiafromgeom", "auto") == "true":
                 raise InputError("inertiafromgeom='true' is not covered. Give each body an inertial element")
         for default in root.findall("default"):
-            _refuse_children(default, "default", {"joint"}, MJCF_SHAPES | {"mesh", "material", "pair"})
+            _refuse_unknown_children(default, "default", {"joint"}, MJCF_SHAPES | {"mesh", "material", "pair"})
             for joint in default.findall("joint"):
                 self.joint_defaults |= joint.attrib
 
     def add_body(self, body: Element, parent: str | None) -> None:
-        """Append a body and the bodies in it to the records."""
+        """Append a body, and recursively the bodies in it, to the records."""
         name = body.get("name") or f"body {len(self.records) + 1}"
-        _refuse_children(body, f"body {name!r}", {"inertial", "joint", "freejoint", "body"}, MJCF_SHAPES)
+        _refuse_unknown_children(body, f"body {name!r}", {"inertial", "joint", "freejoint", "body"}, MJCF_SHAPES)
         for attribute in ("childclass", "mocap", "gravcomp"):
             if body.get(attribute) not in (None, "false", "0"):
                 raise InputError(f"{attribute} of the body {name!r} is not covered")
         joints = body.findall("joint")
-        is_free = _is_free(body)
+        is_free = _has_free_joint(body)
         if is_free != (parent is None) or (is_free and len(joints) + len(body.findall("freejoint")) != 1):
             raise InputError(
                 f"the body {name!r} must have no free joint, which belongs to the base" if is_free
@@ -268,39 +275,41 @@ class _MjcfReader:
         inertial = body.find("inertial")
         if inertial is None:
             raise InputError(f"the body {name!r} needs an inertial element, since inertias of shapes are not computed")
-        R, centre = self._frame(inertial)
-        inertia = R @ _mjcf_inertia(inertial, name) @ R.T
-        rotation, origin = self._frame(body)
-        records = () if is_free else tuple(self._joint(joint, name) for joint in joints)
-        mass = _number(inertial, "mass")
+        R, centre = self._read_frame(inertial)
+        inertia = R @ _read_mjcf_inertia(inertial, name) @ R.T
+        rotation, origin = self._read_frame(body)
+        records = () if is_free else tuple(self._read_joint(joint, name) for joint in joints)
+        mass = _number_attribute(inertial, "mass")
         self.records.append(LinkRecord(name, parent, rotation, origin, mass, centre, inertia, records))
         for child in body.findall("body"):
             self.add_body(child, name)
 
-    def _joint(self, joint: Element, body: str) -> JointRecord:
+    def _read_joint(self, joint: Element, body: str) -> JointRecord:
         attributes = self.joint_defaults | joint.attrib
         joint = Element("joint", attributes)
-        what, kind = f"the joint {attributes.get('name', 'of ' + body)!r}", attributes.get("type", "hinge")
+        joint_text, kind = f"the joint {attributes.get('name', 'of ' + body)!r}", attributes.get("type", "hinge")
         if kind not in ("hinge", "slide"):
-            raise InputError(f"{what} is of type {kind!r}, which is not covered. Supported types are hinge and slide")
+            raise InputError(
+                f"{joint_text} is of type {kind!r}, which is not covered. Supported types are hinge and slide"
+            )
         for attribute in ("armature", "frictionloss", "springdamper", "ref"):
-            _refuse_nonzero(joint, attribute, what)
+            _refuse_nonzero_attribute(joint, attribute, joint_text)
         ignored = MJCF_JOINT_ATTRIBUTES | {"armature", "frictionloss", "springdamper", "ref"}
         if unknown := sorted(set(attributes) - ignored):
-            raise InputError(f"the attribute {unknown[0]!r} of {what} is not covered")
+            raise InputError(f"the attribute {unknown[0]!r} of {joint_text} is not covered")
         unit = self.angle_unit if kind == "hinge" else 1.0
         return JointRecord(
             kind == "slide",
-            _numbers(joint, "pos", 3, np.zeros(3)),
-            _numbers(joint, "axis", 3, np.array([0.0, 0.0, 1.0])),
-            _number(joint, "stiffness", 0.0),
-            _number(joint, "damping", 0.0),
-            unit * _number(joint, "springref", 0.0),
+            _number_array_attribute(joint, "pos", 3, np.zeros(3)),
+            _number_array_attribute(joint, "axis", 3, np.array([0.0, 0.0, 1.0])),
+            _number_attribute(joint, "stiffness", 0.0),
+            _number_attribute(joint, "damping", 0.0),
+            unit * _number_attribute(joint, "springref", 0.0),
         )
 
-    def _frame(self, element: Element) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rotation and the position of the frame of an element."""
-        position = _numbers(element, "pos", 3, np.zeros(3))
+    def _read_frame(self, element: Element) -> tuple[np.ndarray, np.ndarray]:
+        """Read the frame of an MJCF element; return the rotation, shape (3, 3), and the position, shape (3,)."""
+        position = _number_array_attribute(element, "pos", 3, np.zeros(3))
         kinds = [kind for kind in MJCF_ORIENTATIONS if kind in element.attrib]
         if len(kinds) > 1:
             raise InputError(
@@ -309,36 +318,36 @@ class _MjcfReader:
         if not kinds:
             return np.eye(3), position
         if kinds[0] == "quat":
-            return Rotation.from_quat(np.roll(_numbers(element, "quat", 4), -1)).as_matrix(), position
+            return Rotation.from_quat(np.roll(_number_array_attribute(element, "quat", 4), -1)).as_matrix(), position
         if kinds[0] == "axisangle":
-            *axis, angle = _numbers(element, "axisangle", 4)
+            *axis, angle = _number_array_attribute(element, "axisangle", 4)
             direction = np.array(axis) / np.linalg.norm(axis)
             return Rotation.from_rotvec(self.angle_unit * angle * direction).as_matrix(), position
         if kinds[0] == "euler":
-            angles = self.angle_unit * _numbers(element, "euler", 3)
+            angles = self.angle_unit * _number_array_attribute(element, "euler", 3)
             return Rotation.from_euler("XYZ", angles).as_matrix(), position  # eulerseq="xyz" means rotating axes
         raise InputError(f"the orientation of {element.tag} must be quat, axisangle or euler, got {kinds[0]}")
 
 
-def _mjcf_inertia(inertial: Element, name: str) -> np.ndarray:
-    """Return the tensor of inertia in axes of the inertial frame, shape (3, 3)."""
+def _read_mjcf_inertia(inertial: Element, name: str) -> np.ndarray:
+    """Read the tensor of inertia of an MJCF body in axes of the inertial frame, shape (3, 3)."""
     if "fullinertia" in inertial.attrib:
-        return _symmetric(*_numbers(inertial, "fullinertia", 6))
+        return _symmetric_matrix(*_number_array_attribute(inertial, "fullinertia", 6))
     if "diaginertia" in inertial.attrib:
-        return np.diag(_numbers(inertial, "diaginertia", 3))
+        return np.diag(_number_array_attribute(inertial, "diaginertia", 3))
     raise InputError(f"the inertial of {name!r} needs diaginertia or fullinertia")
 
 
-def _symmetric(xx, yy, zz, xy, xz, yz) -> np.ndarray:
-    """Return a symmetric tensor from its entries."""
+def _symmetric_matrix(xx, yy, zz, xy, xz, yz) -> np.ndarray:
+    """Return the symmetric 3 by 3 matrix with the given entries."""
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 # -- from links to bodies ---------------------------------------------------------------------------------------------
 
 
-class _Group:
-    """Links that are fixed in each other, which are one body; axes are parallel to those of the base."""
+class _RigidLinkGroup:
+    """Links that are fixed to each other and so make one rigid body, in axes parallel to those of the base."""
 
     def __init__(self, name: str, parent: str | None, at: np.ndarray, joints: tuple[JointRecord, ...]):
         self.name, self.parent, self.at, self.joints = name, parent, at, joints
@@ -346,37 +355,37 @@ class _Group:
         self.centres: list[np.ndarray] = []
         self.inertias: list[np.ndarray] = []
 
-    def record(self, joint: Joint | None) -> BodyRecord:
-        """Return the body: the sum of its links."""
-        total = sum(self.masses)
-        centre = np.asarray(self.masses) @ np.asarray(self.centres) / total
+    def to_body_record(self, joint: Joint | None) -> BodyRecord:
+        """Return the rigid body that the links make, with their total mass and inertia."""
+        total_mass = sum(self.masses)
+        centre = np.asarray(self.masses) @ np.asarray(self.centres) / total_mass
         inertia = np.zeros((3, 3))
         for m, c, J in zip(self.masses, self.centres, self.inertias, strict=True):
             r = c - centre
             inertia += J + m * (r @ r * np.eye(3) - np.outer(r, r))
-        return BodyRecord(self.name, total, centre, inertia, self.parent, joint)
+        return BodyRecord(self.name, total_mass, centre, inertia, self.parent, joint)
 
 
-def _assemble(links: list[LinkRecord], has_ground: bool) -> list[BodyRecord]:
-    """Return the bodies of links that are listed from the base outwards; links without a joint merge with theirs.
+def _merge_fixed_links(links: list[LinkRecord], has_ground: bool) -> list[BodyRecord]:
+    """Merge links without a joint into their parents, and return the bodies; parents come before their children.
 
     If the base is the ground, its mass and inertia are zero.
     """
-    groups: dict[str, _Group] = {}
+    groups: dict[str, _RigidLinkGroup] = {}
     frames: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}  # group, rotation and origin in it, of each link
     for link in links:
         if link.name in frames:
             raise InputError(f"two bodies have the name {link.name!r}")
         if link.parent is None:
             group_name, R, origin = link.name, np.eye(3), np.zeros(3)
-            groups[link.name] = _Group(link.name, None, np.zeros(3), ())
+            groups[link.name] = _RigidLinkGroup(link.name, None, np.zeros(3), ())
         else:
             group_name, R, origin = frames[link.parent]
             R, origin = R @ link.rotation, origin + R @ link.origin
             if link.joints:
-                position = R @ _common_position(link)
+                position = R @ _common_joint_position(link)
                 rotated = tuple(joint._replace(axis=R @ joint.axis) for joint in link.joints)
-                groups[link.name] = _Group(link.name, group_name, origin + position, rotated)
+                groups[link.name] = _RigidLinkGroup(link.name, group_name, origin + position, rotated)
                 group_name, origin = link.name, -position
         frames[link.name] = group_name, R, origin
         group = groups[group_name]
@@ -388,11 +397,11 @@ def _assemble(links: list[LinkRecord], has_ground: bool) -> list[BodyRecord]:
             group.inertias.append(R @ link.inertia @ R.T)
         elif np.any(link.inertia):
             raise InputError(f"{link.name!r} has an inertia but no mass")
-    return _records(groups, has_ground)
+    return _body_records(groups, has_ground)
 
 
-def _common_position(link: LinkRecord) -> np.ndarray:
-    """Return the point where all joints of a link act."""
+def _common_joint_position(link: LinkRecord) -> np.ndarray:
+    """Return the common position of all joints of a link, shape (3,); raise InputError if they differ."""
     position = link.joints[0].position
     for joint in link.joints[1:]:
         if not np.allclose(joint.position, position, rtol=COINCIDENCE_RTOL, atol=0.0):
@@ -400,8 +409,9 @@ def _common_position(link: LinkRecord) -> np.ndarray:
     return position
 
 
-def _records(groups: dict[str, _Group], has_ground: bool) -> list[BodyRecord]:
-    """Return the bodies; a massless one between two hinges whose axes meet makes them a universal joint."""
+def _body_records(groups: dict[str, _RigidLinkGroup], has_ground: bool) -> list[BodyRecord]:
+    """Return the body records of link groups; a massless body between two hinges at a point becomes a universal
+    joint."""
     records = []
     for group in groups.values():
         is_ground = has_ground and group.parent is None
@@ -410,7 +420,7 @@ def _records(groups: dict[str, _Group], has_ground: bool) -> list[BodyRecord]:
             records.append(BodyRecord(group.name, 0.0, zero, np.zeros((3, 3)), None, None))
         elif not group.masses:
             children = [child for child in groups.values() if child.parent == group.name]
-            if group.parent is None or len(children) != 1 or not _can_merge(group, children[0]):
+            if group.parent is None or len(children) != 1 or not _can_form_universal_joint(group, children[0]):
                 raise InputError(
                     f"the body {group.name!r} has no mass. A massless body is covered if it is fixed in another one, "
                     "or stands between two hinges at one place"
@@ -419,33 +429,39 @@ def _records(groups: dict[str, _Group], has_ground: bool) -> list[BodyRecord]:
             child.parent, child.at, child.joints = group.parent, group.at, group.joints + child.joints
     for group in groups.values():
         if group.masses and not (has_ground and group.parent is None):
-            records.append(group.record(None if group.parent is None else _named_joint(group)))
+            records.append(group.to_body_record(None if group.parent is None else _make_joint_of_body(group)))
     return records
 
 
-def _can_merge(group: _Group, child: _Group) -> bool:
-    """Return True if the joints of a massless body and of its child make a universal joint."""
+def _can_form_universal_joint(group: _RigidLinkGroup, child: _RigidLinkGroup) -> bool:
+    """Return True if the hinges of a massless body and of its child make a universal joint."""
     is_hinge_pair = len(group.joints) == len(child.joints) == 1 and not (
         group.joints[0].slides or child.joints[0].slides
     )
     return is_hinge_pair and float(np.abs(child.at).max()) <= COINCIDENCE_RTOL * float(np.abs(group.at).max())
 
 
-def _named_joint(group: _Group) -> Joint:
-    """Return the joint of a body; InputError with the name of the body if its joint cannot be used."""
+def _make_joint_of_body(group: _RigidLinkGroup) -> Joint:
+    """Make the joint of a body; raise InputError, with the name of the body, if the joint cannot be used."""
     try:
-        return _joint_of(group)
+        return _make_joint(group)
     except InputError as error:
         raise InputError(f"the joint of {group.name!r} cannot be used: {error}") from error
 
 
-def _joint_of(group: _Group) -> Joint:
-    """Return the joint of a body."""
+def _make_joint(group: _RigidLinkGroup) -> Joint:
+    """Make the joint of a group from its records: a hinge, a slider or a universal joint.
+
+    Raises
+    ------
+    InputError
+        If the joints of the group are another combination.
+    """
     joints = group.joints
     if len(joints) == 1:
         joint = joints[0]
-        kind = Slider if joint.slides else Hinge
-        return kind(group.at, joint.axis, joint.stiffness, joint.damping, joint.rest)
+        joint_class = Slider if joint.slides else Hinge
+        return joint_class(group.at, joint.axis, joint.stiffness, joint.damping, joint.rest)
     if len(joints) == 2 and not any(joint.slides for joint in joints):
         axes, stiffness, damping, rests = (
             [getattr(joint, name) for joint in joints] for name in ("axis", "stiffness", "damping", "rest")
@@ -460,73 +476,96 @@ def _joint_of(group: _Group) -> Joint:
 # -- XML --------------------------------------------------------------------------------------------------------------
 
 
-def _read_root(source: str | os.PathLike, tag: str, kind: str) -> Element:
-    """Return the root element of a file, or of a text that begins with ``<``."""
+def _read_xml_root(source: str | os.PathLike, root_tag: str, format_name: str) -> Element:
+    """Parse an XML file, or a text that begins with ``<``, and return its root element.
+
+    Raises
+    ------
+    FileError, InputError
+        If the file cannot be read, the XML is not well-formed or declares entities, or the root has another tag.
+    """
     if isinstance(source, str) and source.lstrip().startswith("<"):
         text = source
     else:
         try:
             text = Path(source).read_text(encoding="utf-8")
         except OSError as error:
-            raise FileError(f"cannot read the {kind} file {os.fspath(source)!r:.200}: {error.strerror}") from error
+            raise FileError(
+                f"cannot read the {format_name} file {os.fspath(source)!r:.200}: {error.strerror}"
+            ) from error
         except (UnicodeDecodeError, TypeError, ValueError) as error:
-            raise FileError(f"cannot read the {kind} file {source!r:.200}: {error}") from error
+            raise FileError(f"cannot read the {format_name} file {source!r:.200}: {error}") from error
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise InputError(f"a {kind} file must not declare entities or a document type")
+        raise InputError(f"a {format_name} file must not declare entities or a document type")
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise InputError(f"the {kind} text is not well-formed XML: {error}") from error
-    if root.tag != tag:
-        raise InputError(f"a {kind} file must have the root element {tag!r}, got {root.tag!r}")
+        raise InputError(f"the {format_name} text is not well-formed XML: {error}") from error
+    if root.tag != root_tag:
+        raise InputError(f"a {format_name} file must have the root element {root_tag!r}, got {root.tag!r}")
     return root
 
 
-def _refuse_children(element: Element, what: str, covered: set[str], ignored: set[str]) -> None:
-    """Raise InputError if an element has a child of another kind."""
+def _refuse_unknown_children(
+    element: Element, element_text: str, covered_tags: set[str], ignored_tags: set[str]
+) -> None:
+    """Raise InputError if an XML element has a child whose tag is neither covered nor ignored."""
     for child in element:
-        if isinstance(child.tag, str) and child.tag not in covered | ignored:
+        if isinstance(child.tag, str) and child.tag not in covered_tags | ignored_tags:
             raise InputError(
-                f"the element {child.tag!r} in {what} is not covered. Remove it if it does not matter, or build the "
-                "tree with lt.bodies.Tree"
+                f"the element {child.tag!r} in {element_text} is not covered. Remove it if it does not matter, or "
+                "build the tree with lt.bodies.Tree"
             )
 
 
-def _refuse_nonzero(element: Element, name: str, what: str) -> None:
-    """Raise InputError if an attribute has a value that is not zero."""
-    if name in element.attrib and _numbers(element, name, len(element.attrib[name].split())).any():
-        raise InputError(f"{name} of {what} must be zero, got {element.attrib[name]!r}")
+def _refuse_nonzero_attribute(element: Element, attribute_name: str, owner_text: str) -> None:
+    """Raise InputError if an XML attribute has a value that is not zero."""
+    if (
+        attribute_name in element.attrib
+        and _number_array_attribute(element, attribute_name, len(element.attrib[attribute_name].split())).any()
+    ):
+        raise InputError(f"{attribute_name} of {owner_text} must be zero, got {element.attrib[attribute_name]!r}")
 
 
-def _child(element: Element, tag: str) -> Element:
+def _only_child(element: Element, tag: str) -> Element:
+    """Return the child of an XML element with this tag; raise InputError unless there is exactly one."""
     children = element.findall(tag)
     if len(children) != 1:
         name = element.get("name")
-        where = element.tag if name is None else f"{element.tag} {name!r}"
-        raise InputError(f"{where} must have one {tag!r}, got {len(children)}")
+        element_text = element.tag if name is None else f"{element.tag} {name!r}"
+        raise InputError(f"{element_text} must have one {tag!r}, got {len(children)}")
     return children[0]
 
 
-def _attribute(element: Element, name: str) -> str:
-    if name not in element.attrib:
-        raise InputError(f"the element {element.tag!r} needs the attribute {name!r}")
-    return element.attrib[name]
+def _required_attribute(element: Element, attribute_name: str) -> str:
+    """Return an attribute of an XML element as text; raise InputError if it is missing."""
+    if attribute_name not in element.attrib:
+        raise InputError(f"the element {element.tag!r} needs the attribute {attribute_name!r}")
+    return element.attrib[attribute_name]
 
 
-def _numbers(element: Element, name: str, count: int, default: np.ndarray | None = None) -> np.ndarray:
-    """Return the numbers of an attribute, shape (count,)."""
-    if default is not None and name not in element.attrib:
+def _number_array_attribute(
+    element: Element, attribute_name: str, count: int, default: np.ndarray | None = None
+) -> np.ndarray:
+    """Parse an XML attribute as finite numbers, shape (count,), or return the default if it is missing.
+
+    Raises
+    ------
+    InputError
+        If the numbers are not finite or not ``count`` ones, or the attribute is missing and has no default.
+    """
+    if default is not None and attribute_name not in element.attrib:
         return default
-    text = _attribute(element, name)
+    text = _required_attribute(element, attribute_name)
     try:
         numbers = np.array([float(word) for word in text.split()])
     except ValueError:
-        raise InputError(f"{name} of {element.tag!r} must be numbers, got {text!r}") from None
+        raise InputError(f"{attribute_name} of {element.tag!r} must be numbers, got {text!r}") from None
     if numbers.shape != (count,) or not np.isfinite(numbers).all():
-        raise InputError(f"{name} of {element.tag!r} must be {count} finite numbers, got {text!r}")
+        raise InputError(f"{attribute_name} of {element.tag!r} must be {count} finite numbers, got {text!r}")
     return numbers
 
 
-def _number(element: Element, name: str, default: float | None = None) -> float:
-    fallback = None if default is None else np.array([default])
-    return float(_numbers(element, name, 1, fallback)[0])
+def _number_attribute(element: Element, attribute_name: str, default: float | None = None) -> float:
+    default_array = None if default is None else np.array([default])
+    return float(_number_array_attribute(element, attribute_name, 1, default_array)[0])

@@ -20,7 +20,7 @@ from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..results.events import Events, EventSeries
 from ..systems import System
 from ..systems.kinds import user_system
-from ..tracing.numpy_calls import PythonCall, with_jax_arrays
+from ..tracing.numpy_calls import PythonCall, accept_jax_arrays
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import trace_callables
 
@@ -101,11 +101,11 @@ class EventSet:
         """True if a function cannot be traced and is called in Python."""
         return any(function.calls_python for function in self.functions)
 
-    def raise_error(self) -> None:
+    def raise_first_error(self) -> None:
         """Raise the exception of an event function that is called in Python, if there was one."""
         for function in self.functions:
             if isinstance(function, EventFunction) and isinstance(function.function, PythonCall):
-                function.function.raise_error()
+                function.function.raise_first_error()
 
 
 class EventSpecification:
@@ -252,7 +252,7 @@ def _checked_event_function(
     shapes = [argument.shape for argument in example]
     state_shape = jax.eval_shape(system.user_state, jax.ShapeDtypeStruct((system.dim,), jnp.float64)).shape
     failure: Exception | None = None
-    for traceable in (call, with_jax_arrays(call)):
+    for traceable in (call, accept_jax_arrays(call)):
         try:
             traced = trace_callables(traceable, lambda f, *a: f(*a), *shapes)
             value = jax.eval_shape(traced, *example)
@@ -299,8 +299,8 @@ def _argument_names(function: Callable) -> tuple[str, ...]:
     names = tuple(name if name in ARGUMENT_NAMES else "x" for name in required) or ("x",)
     if names.count("x") > 1:
         raise InputError(
-            f"an event function has the arguments (x) or (t, x), and any of {', '.join(ARGUMENT_NAMES)} by these "
-            f"names; got {', '.join(required)}"
+            f"an event function must have the arguments (x) or (t, x), and any of {', '.join(ARGUMENT_NAMES)} by "
+            f"these names, got {', '.join(required)}"
         )
     return names
 

@@ -78,7 +78,8 @@ def checked_or_default_method(method, noise: Fluctuations | None = None, *, runs
     Raises
     ------
     InputError
-        If it is no method, or the run is not one of a single trajectory (``runs_alone``) and the method is Reference.
+        If it is not a method, or the method is Reference and the run is not one of a single trajectory
+        (``runs_alone``).
     """
     if method is None:
         return DEFAULT_METHOD if noise is None else DEFAULT_NOISE_METHOD

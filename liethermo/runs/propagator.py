@@ -262,7 +262,8 @@ class Propagator(metaclass=ListedType):
         Raises
         ------
         InputError
-            If the system has no parameter of a name, or a value has another shape.
+            If the system has no parameter of this name, or a value has another shape or is refused by the constructor
+            of its object, as a negative rate is.
         """
         values = {name: np.asarray(value, dtype=np.float64) for name, value in parameters.items()}
         key = tuple((name, value.shape, value.tobytes()) for name, value in sorted(values.items()))

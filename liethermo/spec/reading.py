@@ -41,10 +41,10 @@ from .schema import (
     SampledAxis,
     SpecContents,
     StudySection,
-    describe_exception,
-    format_table,
+    describe_user_error,
+    did_you_mean_text,
+    format_table_entries,
     format_value,
-    suggest_match,
 )
 from .trust import import_function
 
@@ -60,31 +60,31 @@ MAX_REPORTED_FAULTS = 100
 """Maximum number of faults of a section that are listed; the others are counted."""
 
 
-def validate_table(key: str, schema: type, table, problems: list[str], reader_name: str) -> Any:
-    """Return the table converted to the types of the schema, or None after appending its faults to ``problems``."""
+def validate_table_by_schema(key: str, schema: type, table, problems: list[str], reader_name: str) -> Any:
+    """Validate a TOML table by a schema: return it with converted types, or append its faults to ``problems`` and
+    return None."""
     try:
         return TypeAdapter(schema).validate_json(json.dumps(table), strict=True)
     except ValidationError as error:
         faults = error.errors()
-        problems += [_describe_fault(key, fault, schema, reader_name) for fault in faults[:MAX_REPORTED_FAULTS]]
+        problems += [_validation_fault_text(key, fault, schema, reader_name) for fault in faults[:MAX_REPORTED_FAULTS]]
         problems += [f"{key or 'the file'} has {len(faults) - MAX_REPORTED_FAULTS} faults more"] * (
             len(faults) > MAX_REPORTED_FAULTS
         )
         return None
 
 
-def _describe_fault(key: str, fault: Mapping[str, Any], schema: type, consumer: str) -> str:
-    """Return an error of pydantic as a sentence that begins with the key."""
-    name = ".".join(filter(None, [key, *(str(part) for part in _untagged_location(fault["loc"]))]))
+def _validation_fault_text(key: str, fault: Mapping[str, Any], schema: type, reader_name: str) -> str:
+    """Return an error of pydantic as a message that begins with the key of the faulty entry."""
+    name = ".".join(filter(None, [key, *(str(key_part) for key_part in _location_without_union_tags(fault["loc"]))]))
     name = re.sub(r"\.(\d+)\b", r"[\1]", name)
     if fault["type"] == "extra_forbidden":
         keys = _allowed_keys(schema, fault["loc"])
-        return (
-            f"{name}: no such key{suggest_match(fault['loc'][-1], keys)}; {consumer} takes {', '.join(keys) or 'none'}"
-        )
+        hint, allowed_text = did_you_mean_text(fault["loc"][-1], keys), ", ".join(keys) or "none"
+        return f"{name}: no such key{hint}; {reader_name} takes {allowed_text}"
     if fault["type"] == "missing":
         field = _model_fields(schema).get(fault["loc"][-1])
-        return f"{name} is missing" + (f": {field.description}" if field else f"; {consumer} needs it")
+        return f"{name} is missing" + (f": {field.description}" if field else f"; {reader_name} needs it")
     if fault["type"] in ("model_type", "dict_type"):
         return f"{name} = {format_value(fault['input'])}: must be a section [{name}]"
     message = re.sub(r"^Input should|^(List|Tuple) should", "must", fault["msg"])
@@ -95,17 +95,17 @@ UNION_TAG_NAMES = ("number", "table", "list", "points", "sample", "word", "measu
 """Tags of the alternatives of a key, which pydantic inserts into the locations of its errors."""
 
 
-def _untagged_location(parts: tuple) -> list:
-    """Return the location of an error without the tags of alternatives, which may follow any key but the first."""
-    return [part for i, part in enumerate(parts) if i == 0 or part not in UNION_TAG_NAMES]
+def _location_without_union_tags(location: tuple) -> list:
+    """Return the location of a pydantic error without the union tags that pydantic inserts after keys."""
+    return [key_part for i, key_part in enumerate(location) if i == 0 or key_part not in UNION_TAG_NAMES]
 
 
 def _allowed_keys(schema: type, location: tuple) -> list[str]:
-    """Return the keys allowed in the table at which an unknown key was found."""
-    for part in location[:-1]:
-        if isinstance(part, str) and part in SCHEMA_BY_TAG:
-            schema = SCHEMA_BY_TAG[part]
-        elif (field := _model_fields(schema).get(part)) is not None:
+    """Return the keys that the schema allows in the table at a location, for the message about an unknown key."""
+    for key_part in location[:-1]:
+        if isinstance(key_part, str) and key_part in SCHEMA_BY_TAG:
+            schema = SCHEMA_BY_TAG[key_part]
+        elif (field := _model_fields(schema).get(key_part)) is not None:
             nested_models = [kind for kind in (field.annotation, *get_args(field.annotation)) if _model_fields(kind)]
             schema = nested_models[0] if nested_models else schema
     return list(_model_fields(schema) or schema.__annotations__)
@@ -116,42 +116,50 @@ def _model_fields(schema: Any) -> dict[str, Any]:
     return getattr(schema, "model_fields", {})
 
 
-def validate_arguments(key: str, function: Callable, table: dict, problems: list[str]) -> dict[str, Any] | None:
-    """Return the table as keyword arguments of a function, validated by its signature and annotations."""
+def validate_function_arguments(
+    key: str, function: Callable, table: dict, problems: list[str]
+) -> dict[str, Any] | None:
+    """Validate a table by the signature and annotations of a function: return it as keyword arguments, or append its
+    faults to ``problems`` and return None."""
     try:
         hints = get_type_hints(function.__init__ if inspect.isclass(function) else function)
     except Exception:  # annotations with names that exist only for type checkers
         hints = {}
     fields: dict[str, Any] = {}
-    extra: Literal["allow", "forbid"] = "forbid"
+    extra_keys_rule: Literal["allow", "forbid"] = "forbid"
     for name, parameter in inspect.signature(function).parameters.items():
         if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
             requirement = Required if parameter.default is parameter.empty else NotRequired
             fields[name] = requirement[_toml_value_type(hints.get(name, Any))]
         elif parameter.kind is parameter.VAR_KEYWORD:
-            extra = "allow"
+            extra_keys_rule = "allow"
     name = callable_name(function, "the function")
-    schema = with_config(ConfigDict(extra=extra))(TypedDict(name, fields))  # type: ignore[operator]
-    return validate_table(key, schema, table, problems, name)
+    schema = with_config(ConfigDict(extra=extra_keys_rule))(TypedDict(name, fields))  # type: ignore[operator]
+    return validate_table_by_schema(key, schema, table, problems, name)
 
 
-def _toml_value_type(hint) -> Any:
-    """Return the alternative of a type hint that a TOML value can have; Any if there is not exactly one."""
-    if get_origin(hint) in (Union, UnionType):
-        alternatives = [part for part in get_args(hint) if part is not NoneType and _is_toml_value_type(part)]
+def _toml_value_type(type_hint) -> Any:
+    """Return the only member of a union type that a TOML value can have; Any if there is not exactly one."""
+    if get_origin(type_hint) in (Union, UnionType):
+        alternatives = [
+            alternative
+            for alternative in get_args(type_hint)
+            if alternative is not NoneType and _is_toml_value_type(alternative)
+        ]
         return alternatives[0] if len(alternatives) == 1 else Any
-    return hint if _is_toml_value_type(hint) else Any
+    return type_hint if _is_toml_value_type(type_hint) else Any
 
 
-def _is_toml_value_type(hint) -> bool:
-    if get_origin(hint) in (list, tuple, Sequence, dict, Mapping):
-        return all(part is Ellipsis or _is_toml_value_type(part) for part in get_args(hint))
-    return get_origin(hint) is Literal or hint in (bool, int, float, str, list, tuple, dict, Any)
+def _is_toml_value_type(type_hint) -> bool:
+    """Return True if TOML values can be of this type: numbers, texts, lists and tables of these."""
+    if get_origin(type_hint) in (list, tuple, Sequence, dict, Mapping):
+        return all(argument is Ellipsis or _is_toml_value_type(argument) for argument in get_args(type_hint))
+    return get_origin(type_hint) is Literal or type_hint in (bool, int, float, str, list, tuple, dict, Any)
 
 
 @dataclass(frozen=True)
 class Spec:
-    """A validated spec file: a run that is ready to start.
+    """The validated content of a spec file, from which a run or a study is started.
 
     Attributes
     ----------
@@ -208,7 +216,7 @@ class Spec:
         return f"{self.model_name}, {self.method}, {step}, t = {start:g} to {end:g}"
 
     def build_system(self) -> System:
-        """Build the system, and check the initial state and the figures against it.
+        """Build and return the system, after checking that the initial state and the figures suit it.
 
         Raises
         ------
@@ -222,7 +230,7 @@ class Spec:
         except AxiomError:
             raise
         except Exception as error:  # user code
-            raise self._model_error(describe_exception(error, self.build)) from error
+            raise self._model_error(describe_user_error(error, self.build)) from error
         if not isinstance(system, System):
             raise self._model_error(f"it returned {system!r:.60}, not a system such as lt.LiePoissonSystem")
         try:
@@ -240,7 +248,8 @@ class Spec:
         return self.table["model"].get("name") or self.table["model"]["function"]
 
     def _model_error(self, reason: str) -> SpecError:
-        return SpecError(self.path, [f"{format_table('model', self.table['model'])}: {reason}"])
+        """Return a SpecError about the section ``[model]``."""
+        return SpecError(self.path, [f"{format_table_entries('model', self.table['model'])}: {reason}"])
 
 
 def read(
@@ -249,7 +258,7 @@ def read(
     allow: Sequence[str] = (),
     report: Callable[[str], object] | None = None,
 ) -> Spec:
-    """Read a spec file and validate everything but the system, which :meth:`Spec.build_system` validates.
+    """Read a spec file and return its validated content; :meth:`Spec.build_system` validates the system.
 
     Parameters
     ----------
@@ -272,15 +281,16 @@ def read(
     table = _parse_file(path)
     problems: list[str] = []
     for change in changes:
-        _apply_change(table, change, problems)
-    validate_table("", SpecContents, table, problems, "a spec file")
+        _apply_command_line_change(table, change, problems)
+    validate_table_by_schema("", SpecContents, table, problems, "a spec file")
     section_names = [name for name in SECTIONS if name != "study" or "study" in table]
     sections = {
-        name: validate_table(name, SECTIONS[name], table.get(name, {}), problems, f"[{name}]") for name in section_names
+        name: validate_table_by_schema(name, SECTIONS[name], table.get(name, {}), problems, f"[{name}]")
+        for name in section_names
     }
     model, run, method, outputs = (sections[name] for name in ("model", "run", "method", "outputs"))
-    build: Any = model and _model_function(model, path.resolve().parent, allow, report, problems)
-    parameters: Any = build and validate_arguments("model.parameters", build, model.parameters, problems)
+    build: Any = model and _import_model_function(model, path.resolve().parent, allow, report, problems)
+    parameters: Any = build and validate_function_arguments("model.parameters", build, model.parameters, problems)
     integrator = method and _build_method(method, problems)
     if problems:
         raise SpecError(path, problems)
@@ -295,6 +305,7 @@ MAX_KEY_PARTS = 100
 
 
 def _parse_file(path: Path) -> dict[str, Any]:
+    """Read a TOML file as JSON data; raise FileError if it cannot be read, SpecError if it is too large or invalid."""
     with disk.file_errors("read the spec file", path), open(path, "rb") as file:
         content = file.read(MAX_SPEC_BYTES + 1)
     if len(content) > MAX_SPEC_BYTES:
@@ -306,7 +317,7 @@ def _parse_file(path: Path) -> dict[str, Any]:
 
 
 def _parse_toml(text: str) -> dict[str, Any]:
-    """Return TOML text as JSON data; raise ValueError if it is invalid or nested too deeply."""
+    """Parse TOML text and return it as JSON data; raise ValueError if it is invalid or nested too deeply."""
     for number, line in enumerate(text.splitlines(), start=1):
         if line.partition("=")[0].count(".") > MAX_KEY_PARTS and not line.lstrip().startswith("#"):
             raise ValueError(f"a key of more than {MAX_KEY_PARTS} parts (at line {number})")
@@ -318,36 +329,40 @@ def _parse_toml(text: str) -> dict[str, Any]:
         raise ValueError("it has lists or tables inside each other, too many") from None
 
 
-def _apply_change(table: dict[str, Any], change: str, problems: list[str]) -> None:
-    """Apply one ``--set`` option to the content of a file."""
+def _apply_command_line_change(table: dict[str, Any], change: str, problems: list[str]) -> None:
+    """Set the entry of the spec that a command-line option ``--set section.key=value`` changes.
+
+    A fault of the option is appended to ``problems``.
+    """
     key, equals, text = change.partition("=")
-    parts = key.strip().split(".")
-    if not equals or not all(parts):
+    key_parts = key.strip().split(".")
+    if not equals or not all(key_parts):
         problems.append(f"--set {change}: must be section.key=value, such as run.step=0.01")
         return
-    if len(parts) > MAX_KEY_PARTS:
+    if len(key_parts) > MAX_KEY_PARTS:
         problems.append(f"--set {change:.60}...: a key of more than {MAX_KEY_PARTS} parts")
         return
     try:
         value = _parse_toml(f"value = {text}")["value"]
     except (ValueError, KeyError):
         value = text.strip()  # a text whose quotes the shell has removed
-    for part in parts[:-1]:
-        table = table.setdefault(part, {})
+    for key_part in key_parts[:-1]:
+        table = table.setdefault(key_part, {})
         if not isinstance(table, dict):
-            problems.append(f"--set {change}: {part} is not a section")
+            problems.append(f"--set {change}: {key_part} is not a section")
             return
-    table[parts[-1]] = value
+    table[key_parts[-1]] = value
 
 
-def _model_function(
+def _import_model_function(
     model: Model,
     folder: Path,
     allowed_modules: Sequence[str],
     report: Callable[[str], object] | None,
     problems: list[str],
 ) -> Callable[..., System] | None:
-    """Return the function that the section ``[model]`` names, or None after appending a fault to ``problems``."""
+    """Import the function that the section ``[model]`` names; append a fault to ``problems`` and return None if that
+    fails."""
     if model.name is not None and model.function is None:
         return getattr(models, model.name)
     if model.function is not None and model.name is None:
@@ -362,20 +377,22 @@ def _model_function(
 
 
 def _build_method(method: Method, problems: list[str]):
+    """Build the integrator that the section ``[method]`` describes; append a fault to ``problems`` and return None if
+    that fails."""
     if method.name is None and not method.model_extra:
         return DEFAULT_METHOD
-    kind = METHODS[method.name or "MetriplecticMidpoint"]
-    options = validate_arguments("method", kind, method.model_extra or {}, problems)
+    method_class = METHODS[method.name or "MetriplecticMidpoint"]
+    options = validate_function_arguments("method", method_class, method.model_extra or {}, problems)
     if options is None:
         return None
     try:
-        return kind(**options)
+        return method_class(**options)
     except (TypeError, ValueError) as error:
         allowed_words = set(re.findall(r"\w+", str(error))).difference(
             map(str, options.values())
         )  # words of the message without the given values
-        hints = [suggest_match(value, allowed_words) for value in options.values() if isinstance(value, str)]
-        problems.append(f"{format_table('method', options)}: {error}{''.join(hints)}")
+        hints = [did_you_mean_text(value, allowed_words) for value in options.values() if isinstance(value, str)]
+        problems.append(f"{format_table_entries('method', options)}: {error}{''.join(hints)}")
         return None
 
 
@@ -385,7 +402,7 @@ INITIAL_STATE_KEY = "initial"
 
 @dataclass(frozen=True)
 class PointBuilder:
-    """Picklable function of the parameters of a point: it calls ``build`` with a table in which these are set."""
+    """Picklable function that calls ``build`` with a table of arguments in which the parameters of a point are set."""
 
     build: Callable[..., Any]
     table: Mapping[str, Any]
@@ -394,18 +411,18 @@ class PointBuilder:
     def __call__(self, point: Mapping[str, Any]) -> Any:
         table = copy.deepcopy(dict(self.table))
         for name in self.varied_names:
-            _set_entry(table, name, point[name])
+            _set_table_entry(table, name, point[name])
         return self.build(**table)
 
 
-def _initial_state(initial: Sequence[Any]) -> jnp.ndarray:
-    """Return the initial state, shape (n,), some of whose entries may be traced."""
+def _stack_initial_state(initial: Sequence[Any]) -> jnp.ndarray:
+    """Return an array of shape (n,) from the entries of an initial state, some of which may be traced."""
     return jnp.stack([jnp.asarray(value, dtype=jnp.float64) for value in initial])
 
 
-def _set_entry(table: dict[str, Any], name: str, value: Any) -> None:
-    """Set ``rate`` or an entry such as ``inertia[0]`` in a table, copying the lists on the way."""
-    key, *index = _parse_entry_name(name)
+def _set_table_entry(table: dict[str, Any], entry_name: str, value: Any) -> None:
+    """Set a key such as ``rate``, or a list entry such as ``inertia[0]``, in a table; lists are copied before."""
+    key, *index = _parse_entry_name(entry_name)
     if not index:
         table[key] = value
         return
@@ -416,13 +433,14 @@ def _set_entry(table: dict[str, Any], name: str, value: Any) -> None:
     container[index[-1]] = value
 
 
-def _parse_entry_name(name: str) -> list[Any]:
-    key, *index = re.split(r"[\[\]]+", name.rstrip("]")) if "[" in name else [name]
+def _parse_entry_name(entry_name: str) -> list[Any]:
+    """Split a name such as ``inertia[0][1]`` into its key and indices, ``["inertia", 0, 1]``."""
+    key, *index = re.split(r"[\[\]]+", entry_name.rstrip("]")) if "[" in entry_name else [entry_name]
     return [key, *map(int, index)]
 
 
 def build_study(spec: Spec, store: str | os.PathLike) -> Study:
-    """Return the study that a spec file describes.
+    """Build the :class:`Study` that the section ``[study]`` of a spec file describes.
 
     Raises
     ------
@@ -443,7 +461,7 @@ def build_study(spec: Spec, store: str | os.PathLike) -> Study:
         for name in (values.columns if isinstance(values, Zipped) and values.columns else [axis])
     ]
     for name in names:
-        _report_if_not_settable(name, spec, problems)
+        _check_parameter_can_vary(name, spec, problems)
     if problems:
         raise SpecError(spec.path, problems)
     parameter_names, state_names = (
@@ -458,7 +476,7 @@ def build_study(spec: Spec, store: str | os.PathLike) -> Study:
         return Study(
             PointBuilder(spec.build, parameters, tuple(parameter_names)),
             axes,
-            x0=PointBuilder(_initial_state, {INITIAL_STATE_KEY: initial}, tuple(state_names))
+            x0=PointBuilder(_stack_initial_state, {INITIAL_STATE_KEY: initial}, tuple(state_names))
             if state_names
             else np.array(initial),
             t_span=spec.run.t_span,
@@ -478,12 +496,13 @@ def build_study(spec: Spec, store: str | os.PathLike) -> Study:
 
 
 def _parse_axis(key: str, axis: Any, problems: list[str]) -> Any:
-    """Return an axis as an argument of :class:`Study`, or None after appending a fault to ``problems``."""
+    """Convert an axis of a spec file to the argument of :class:`Study`; append a fault to ``problems`` and return None
+    if that fails."""
     try:
         if isinstance(axis, EvenlySpacedAxis):
             grid_function = np.geomspace if axis.scale == "log" else np.linspace
             if axis.scale == "log" and min(axis.first, axis.last) <= 0.0:
-                raise InputError("the values of a logarithmic axis are positive")
+                raise InputError("the values of a logarithmic axis must be positive")
             return grid_function(axis.first, axis.last, axis.points)
         if not isinstance(axis, SampledAxis):
             return axis
@@ -500,7 +519,8 @@ def _parse_axis(key: str, axis: Any, problems: list[str]) -> Any:
 
 
 def _parse_measure(key: str, measure: Any, problems: list[str]) -> Any:
-    """Return a measure as an argument of :class:`Study`, or None after appending a fault to ``problems``."""
+    """Convert a measure of a spec file to the argument of :class:`Study`; append a fault to ``problems`` and return
+    None if that fails."""
     if not isinstance(measure, MeasureTable):
         return measure
     if (measure.relaxed is None) == (measure.at is None):
@@ -513,27 +533,29 @@ def _parse_measure(key: str, measure: Any, problems: list[str]) -> Any:
         return None
 
 
-def _report_if_not_settable(name: str, plan: Spec, problems: list[str]) -> None:
-    """Append a fault to ``problems`` unless an axis can vary the parameter of this name."""
-    if not re.fullmatch(r"\w+(\[\d{1,9}\])*", name):
+def _check_parameter_can_vary(parameter_name: str, spec: Spec, problems: list[str]) -> None:
+    """Append a fault to ``problems`` unless the axis of a study can vary the parameter: a number, or a list entry."""
+    if not re.fullmatch(r"\w+(\[\d{1,9}\])*", parameter_name):
         problems.append(
-            f"study.axes: {format_value(name)} must be the name of a parameter, or an entry such as inertia[0]"
+            f"study.axes: {format_value(parameter_name)} must be the name of a parameter, or an entry such as "
+            "inertia[0]"
         )
         return
-    key, *index = _parse_entry_name(name)
-    arguments = {**plan.model_arguments, INITIAL_STATE_KEY: list(plan.run.initial)}
+    key, *index = _parse_entry_name(parameter_name)
+    arguments = {**spec.model_arguments, INITIAL_STATE_KEY: list(spec.run.initial)}
     if key not in arguments:
         options = [*arguments]
-        hint = suggest_match(key, options)
-        problems.append(f"study.axes: {plan.model_name} has no parameter {key}{hint}; it has {', '.join(options)}")
+        hint = did_you_mean_text(key, options)
+        problems.append(f"study.axes: {spec.model_name} has no parameter {key}{hint}; it has {', '.join(options)}")
         return
     value = arguments[key]
     for i in index:
         if not isinstance(value, list | tuple) or i >= len(value):
-            problems.append(f"study.axes: {name} is not an entry of {key} = {format_value(arguments[key])}")
+            problems.append(f"study.axes: {parameter_name} is not an entry of {key} = {format_value(arguments[key])}")
             return
         value = value[i]
     if isinstance(value, list | tuple):
         problems.append(
-            f"study.axes: {name} = {format_value(value)} is a list; an axis is one entry of it, such as {name}[0]"
+            f"study.axes: {parameter_name} = {format_value(value)} is a list; an axis is one entry of it, "
+            f"such as {parameter_name}[0]"
         )

@@ -18,33 +18,33 @@ from .. import models
 from ..integrators import METHODS
 
 
-def validation_error(message: str) -> PydanticCustomError:
+def pydantic_error(message: str) -> PydanticCustomError:
     return PydanticCustomError("refused", "{message}", {"message": message})
 
 
 def format_value(value) -> str:
-    """Return a value as JSON text, at most 60 characters long, which is nearly its TOML text."""
+    """Return a value as text, nearly as in TOML, shortened to at most 60 characters."""
     text = json.dumps(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def format_table(key: str, table: Mapping[str, Any]) -> str:
-    """Return all entries of a table as "key = value" with full keys."""
+def format_table_entries(key: str, table: Mapping[str, Any]) -> str:
+    """Return all entries of a table as a text of "key = value" pairs with full keys."""
     return ", ".join(
-        format_table(f"{key}.{name}", value)
+        format_table_entries(f"{key}.{name}", value)
         if isinstance(value, dict) and value
         else f"{key}.{name} = {format_value(value)}"
         for name, value in table.items()
     )
 
 
-def suggest_match(word: str, options: Iterable[str]) -> str:
+def did_you_mean_text(word: str, options: Iterable[str]) -> str:
     matches = difflib.get_close_matches(word, options, n=1)
     return f" (did you mean {matches[0]}?)" if matches else ""
 
 
-def describe_exception(error: Exception, function: Callable) -> str:
-    """Return the error's text; for an error of user code also its type and the line of the function."""
+def describe_user_error(error: Exception, function: Callable) -> str:
+    """Return the text of an error; if user code raised it, with its type and the line of the function."""
     if type(error).__module__.split(".")[0] in ("liethermo", "manifolds"):
         return str(error)
     source_file = inspect.getsourcefile(inspect.unwrap(function)) if inspect.isroutine(function) else None
@@ -66,24 +66,24 @@ MAX_AXIS_VALUES = 10**7
 def one_of_validator(options: Iterable[str]) -> BeforeValidator:
     allowed_values = list(options)
 
-    def check(value):
+    def require_allowed(value):
         if value not in allowed_values:
-            hint = suggest_match(str(value), allowed_values)
-            raise validation_error(f"must be one of {', '.join(map(format_value, allowed_values))}{hint}")
+            hint = did_you_mean_text(str(value), allowed_values)
+            raise pydantic_error(f"must be one of {', '.join(map(format_value, allowed_values))}{hint}")
         return value
 
-    return BeforeValidator(check)
+    return BeforeValidator(require_allowed)
 
 
 def _require_increasing(span: tuple[float, float]) -> tuple[float, float]:
     if span[1] <= span[0]:
-        raise validation_error("must increase")
+        raise pydantic_error("must increase")
     return span
 
 
 def _require_netcdf_name(name: str) -> str:
     if not re.fullmatch(r"[^/\\]+\.nc", name):
-        raise validation_error('must be a file name that ends in .nc, without a folder, such as "solution.nc"')
+        raise pydantic_error('must be a file name that ends in .nc, without a folder, such as "solution.nc"')
     return name
 
 
@@ -129,12 +129,13 @@ class StopCondition(Section):
     relaxed: FiniteFloat = Field(gt=0, description="the rate of relaxation below which the run ends: `lt.Relaxed(tol)`")
 
 
-def _step_tag(value: Any) -> str:
+def _step_union_tag(value: Any) -> str:
     return "table" if isinstance(value, dict) else "number"
 
 
 Step = Annotated[
-    Annotated[FiniteFloat, Field(gt=0), Tag("number")] | Annotated[AdaptiveStep, Tag("table")], Discriminator(_step_tag)
+    Annotated[FiniteFloat, Field(gt=0), Tag("number")] | Annotated[AdaptiveStep, Tag("table")],
+    Discriminator(_step_union_tag),
 ]
 
 
@@ -202,7 +203,7 @@ class SampledAxis(Section):
     seed: int = Field(0, ge=0, description="the seed of the sample")
 
 
-def _axis_tag(value: Any) -> str:
+def _axis_union_tag(value: Any) -> str:
     return "list" if not isinstance(value, dict) else "points" if "points" in value else "sample"
 
 
@@ -210,7 +211,7 @@ AxisEntry = Annotated[
     Annotated[list[FiniteFloat | str], Field(min_length=1), Tag("list")]
     | Annotated[EvenlySpacedAxis, Tag("points")]
     | Annotated[SampledAxis, Tag("sample")],
-    Discriminator(_axis_tag),
+    Discriminator(_axis_union_tag),
 ]
 
 
@@ -224,12 +225,12 @@ class MeasureTable(Section):
     what: str = Field("x", description="the measured series: x, energy, entropy or attitude")
 
 
-def _measure_tag(value: Any) -> str:
+def _measure_union_tag(value: Any) -> str:
     return "measure" if isinstance(value, dict) else "word"
 
 
 MeasureEntry = Annotated[
-    Annotated[str, Tag("word")] | Annotated[MeasureTable, Tag("measure")], Discriminator(_measure_tag)
+    Annotated[str, Tag("word")] | Annotated[MeasureTable, Tag("measure")], Discriminator(_measure_union_tag)
 ]
 
 
@@ -258,7 +259,7 @@ SECTIONS = {"model": Model, "run": Run, "method": Method, "outputs": Outputs, "s
 
 
 def list_spec_keys() -> list[tuple[str, str, str, str]]:
-    """Return a row (section, key, default, description) for every key of a spec file, for the documentation."""
+    """Return a row (section, key, default, description) for each key of a spec file, for the reference pages."""
     tables = {"run.step": AdaptiveStep, "run.until": StopCondition, "study.axes.NAME": (EvenlySpacedAxis, SampledAxis)}
     sections = [*SECTIONS.items(), *tables.items(), ("study.measure.NAME", MeasureTable)]
     rows = []

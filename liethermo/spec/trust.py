@@ -18,7 +18,7 @@ from types import ModuleType
 from typing import Any
 
 from ..errors import InputError
-from .schema import suggest_match
+from .schema import did_you_mean_text
 
 
 def import_function(
@@ -64,7 +64,7 @@ def import_function(
     if function not in defined_names:
         explanation = "is only imported there" if hasattr(module, function) else "is not there"
         raise InputError(
-            f"{name} defines no function {function!r}: it {explanation}{suggest_match(function, defined_names)}"
+            f"{name} defines no function {function!r}: it {explanation}{did_you_mean_text(function, defined_names)}"
         )
     return getattr(module, function)
 
@@ -74,41 +74,43 @@ def _is_defined_in(value: Any, module: ModuleType) -> bool:
     return (inspect.isfunction(value) or inspect.isclass(value)) and value.__module__ == module.__name__
 
 
-def _import_by_name(name: str, folder: Path) -> ModuleType:
-    with _extended_import_path(Path.cwd(), folder):
-        return importlib.import_module(name)
+def _import_by_name(module_name: str, folder: Path) -> ModuleType:
+    """Import a module by name, from the working directory or the folder of the spec file if it is not installed."""
+    with _temporary_import_path(Path.cwd(), folder):
+        return importlib.import_module(module_name)
 
 
-def _load_from_file(name: str, file: Path, folder: Path) -> ModuleType:
-    """Load the module of this name from a file, unless it has been loaded already."""
-    loaded_module = sys.modules.get(name)
+def _load_from_file(module_name: str, file: Path, folder: Path) -> ModuleType:
+    """Load a module from its file, unless it has been loaded already; raise InputError if another module has its
+    name."""
+    loaded_module = sys.modules.get(module_name)
     if loaded_module is not None and getattr(loaded_module, "__file__", None) == str(file):
         return loaded_module
-    if name not in _spec_module_names and (
-        loaded_module is not None or _exists_elsewhere(name.partition(".")[0], folder)
+    if module_name not in _spec_module_names and (
+        loaded_module is not None or _is_module_elsewhere(module_name.partition(".")[0], folder)
     ):
-        raise InputError(f"there is another module {name!r}. Call {file.name} something else")
-    spec = importlib.util.spec_from_file_location(name, file)
+        raise InputError(f"there is another module {module_name!r}. Call {file.name} something else")
+    spec = importlib.util.spec_from_file_location(module_name, file)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
+    sys.modules[module_name] = module
     try:
-        with _extended_import_path(folder):
+        with _temporary_import_path(folder):
             spec.loader.exec_module(module)
     except BaseException:
-        del sys.modules[name]
+        del sys.modules[module_name]
         raise
-    _spec_module_names.add(name)
+    _spec_module_names.add(module_name)
     return module
 
 
-def _exists_elsewhere(name: str, folder: Path) -> bool:
-    """Return True if a module of this name exists elsewhere, which a file beside the spec would then shadow."""
+def _is_module_elsewhere(module_name: str, folder: Path) -> bool:
+    """Return True if a module can be imported from outside the folder of the spec file."""
     original_path = list(sys.path)
     sys.path[:] = [path for path in original_path if Path(path or ".").resolve() not in (folder, Path.cwd())]
     try:
-        module_spec = importlib.util.find_spec(name)
+        module_spec = importlib.util.find_spec(module_name)
     except ValueError:  # a loaded module without a specification
         return True
     finally:
@@ -119,8 +121,8 @@ def _exists_elsewhere(name: str, folder: Path) -> bool:
 
 
 @contextlib.contextmanager
-def pickling_by_value(folder: Path) -> Iterator[None]:
-    """Pickle modules beside the spec by value, since the workers of a cluster cannot import them."""
+def pickle_spec_modules_by_value(folder: Path) -> Iterator[None]:
+    """Make cloudpickle pickle the modules beside the spec file by value, as cluster workers cannot import them."""
     import cloudpickle
 
     local_modules = [
@@ -145,8 +147,8 @@ _spec_module_names: set[str] = set()
 
 
 @contextlib.contextmanager
-def _extended_import_path(*folders: Path) -> Iterator[None]:
-    """Append folders to the import path during an import; appended last, their files shadow no installed module."""
+def _temporary_import_path(*folders: Path) -> Iterator[None]:
+    """Append folders to ``sys.path`` for the duration of a block; installed modules keep precedence."""
     original_path = list(sys.path)
     sys.path += [str(folder) for folder in folders if str(folder) not in sys.path]
     importlib.invalidate_caches()

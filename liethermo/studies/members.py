@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..errors import InputError
-from ..functions.conditions import collect_conditions, refusal_message
+from ..functions.conditions import collect_conditions, condition_message
 from ..runs.named_parameters import find_parameter, lookup_parameter, named_parameters, replace_parameters
 from ..runs.system_family import Family
 from ..systems import System
@@ -75,7 +75,7 @@ def system_builder(
     Raises
     ------
     InputError
-        If the system has no parameter of a name, or ``build`` is neither a system nor a function.
+        If the system has no parameter of this name, or ``build`` is neither a system nor a function.
     """
     if not isinstance(build, System):
         if not callable(build):
@@ -223,7 +223,7 @@ class _ParameterConditions:
         results = evaluate_in_batches(self._evaluate_batch, points, n_points)
         for k, message in enumerate(self._messages):
             for i in map(int, np.flatnonzero(~results[2 * k])):
-                messages_by_index.setdefault(i, refusal_message(message, results[2 * k + 1][i]))
+                messages_by_index.setdefault(i, condition_message(message, results[2 * k + 1][i]))
         return messages_by_index
 
 

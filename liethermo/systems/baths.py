@@ -21,14 +21,14 @@ from ..functions.bath_energy import (
     DrivenReservoirEnergy,
     ReservoirEnergy,
     ZeroEnergy,
-    bath_terms,
+    bath_energy_terms,
     make_bath_energy,
 )
 from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers
 from ..functions.energy import Energy, Sum
 from ..functions.mechanics import Each
-from ..tracing.short_form import arguments_form
+from ..tracing.short_form import format_arguments
 
 
 class HeatBaths(Module):
@@ -84,8 +84,8 @@ class HeatBaths(Module):
 
     def __repr__(self) -> str:
         if isinstance(self.energy, BathEnergy):
-            return f"HeatBaths({arguments_form(vars(self.energy))})"
-        return f"HeatBaths({arguments_form(vars(self))})"
+            return f"HeatBaths({format_arguments(vars(self.energy))})"
+        return f"HeatBaths({format_arguments(vars(self))})"
 
     def __init__(self, capacity=1.0, temperature=1.0, number: int | None = None, energy=None):
         if number is None:
@@ -124,13 +124,14 @@ class HeatBaths(Module):
         constant = np.array([i for i, f in enumerate(functions) if f is None and i not in driven], dtype=int)
         if constant.size:
             terms.append(make_bath_energy(C[constant], T[constant]).on(constant))
-        self.energy = Sum.of(terms)
+        self.energy = Sum.from_terms(terms)
 
     @property
     def has_positive_temperatures(self) -> bool:
         """True if the temperatures are positive in every state by construction."""
         return all(
-            isinstance(term, BathEnergy | ReservoirEnergy | DrivenReservoirEnergy) for term in bath_terms(self.energy)
+            isinstance(term, BathEnergy | ReservoirEnergy | DrivenReservoirEnergy)
+            for term in bath_energy_terms(self.energy)
         )
 
     @property

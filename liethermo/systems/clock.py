@@ -80,7 +80,7 @@ def system_of_step(system: AnySystem, x) -> AnySystem:
     clock = system.clock
     if clock is None or not clock.span.breaks.size:
         return system
-    return replace_time_span(system, clock.span.interval_at(clock.time(x)))
+    return replace_time_span(system, clock.span.interval_between_breaks_at(clock.time(x)))
 
 
 def add_jump_of_energy(clock: Clock, x, amount) -> jax.Array:

@@ -70,7 +70,7 @@ class DrivenSystem(LiftedSystem):
         self.body, self.unit, self.dim, self.attitude, self.torque = body, unit, body.dim + 2, None, None
         self.space = None if body.space is None else mf.Product(body.space, mf.Euclidean(2))
         if body.space is not None and body.space.dtype.kind == "c":
-            raise InputError(f"an energy that depends on time is for real spaces, and {body.space.name} is complex")
+            raise InputError(f"an energy that depends on time needs a real space, but {body.space.name} is complex")
         self.poisson = ProductPoisson(body.poisson, _ClockPoisson(unit))
         energy = Sum((*map(self._extend_term, body.energy.terms), _NegativeWork(unit)))
         self.energy = energy if self.space is not None else with_polynomial_degrees(energy, self.dim)

@@ -24,7 +24,7 @@ from ..functions.checks import with_polynomial_degrees
 from ..functions.energy import Energy
 from ..functions.surface import ConstraintSurface
 from ..tracing.interpret import evaluate_at_points
-from ..tracing.programs import subprogram
+from ..tracing.programs import jit_subprogram
 from .base import System
 from .domain import Domain
 from .interface import EngineHints, WrappedSystem
@@ -159,7 +159,7 @@ class _TangentDissipation(LiftedDissipation):
         return self.inner.divergence(self.manifold, system.surface.project_state(x))
 
 
-@subprogram
+@jit_subprogram
 def _tangent_force(force: _TangentDissipation, x, dH, dS, dL) -> jax.Array:
     geometry = force.lifted_geometry(force.manifold, x)
     velocity = force.inner.force(geometry.system, geometry.x, *geometry.inner_gradients(dH, dS, dL))
@@ -227,7 +227,7 @@ def _tangential_part(system: System, x, w):
     return _tangential_part_in_space(_require_space(system), x, w)
 
 
-@subprogram
+@jit_subprogram
 def _tangential_part_in_space(space: mf.Space, x, w):
     return space.to_vector(space._tangential_part(space.from_vector(x), space.from_vector(w)))
 

@@ -226,7 +226,7 @@ class SystemInterface(Geometry):
     def inertia(self) -> np.ndarray | None:
         """The tensor of inertia, shape (3, 3), of a rigid body whose state begins with its angular momentum.
 
-        All internal parts count as fixed. None if the system is no such body, or the tensor is not known.
+        All internal parts count as fixed. None if the system is not such a body, or the tensor is not known.
         """
         return None
 

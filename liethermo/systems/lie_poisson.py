@@ -161,7 +161,15 @@ class LiePoissonSystem(TorqueSystem):
         return quantities._replace(momentum_scale=lambda x: jnp.max(jnp.abs(x[rotors])))
 
     def state(
-        self, x=None, batch: bool = False, *, angular_velocity=None, rotor_rates=None, temperature=None, t=None
+        self,
+        x=None,
+        batch: bool = False,
+        *,
+        angular_velocity=None,
+        rotor_rates=None,
+        temperature=None,
+        t=None,
+        degrees: bool = False,
     ) -> jax.Array:
         """Return ``x`` as a checked state, or the state of a rigid body with a given angular velocity.
 
@@ -169,8 +177,8 @@ class LiePoissonSystem(TorqueSystem):
         ----------
         x : array, shape (n,), or (..., n) with ``batch``; optional
             A state. InputError if it is none, or if both or neither of it and the angular velocity are given.
-        batch : bool
-            Whether leading axes are several states.
+        batch, degrees : bool
+            Whether leading axes are several states, and whether the rates are in degrees / time.
         angular_velocity : array, shape (3,), or (..., 3) with ``batch``; optional
             Omega in body axes (rad / time), instead of x. The momentum is the one at which ``dH/dmu = (Omega, w)``.
         rotor_rates : array, shape (k,), or (..., k) with ``batch``; optional
@@ -186,12 +194,12 @@ class LiePoissonSystem(TorqueSystem):
         >>> body.state(angular_velocity=(0.1, 0.2, 0.3), temperature=1.0).tolist()
         [0.30000000000000004, 0.4, 0.3, 0.0]
         """
-        details = {"rotor_rates": rotor_rates, "temperature": temperature}
+        details = {"rotor_rates": rotor_rates, "temperature": temperature, "degrees": degrees or None}
         if not is_given_by_velocity(self, x, angular_velocity, "momentum", **details):
             return super().state(x, batch)
         if temperature is not None and not self.baths.number:
             raise InputError("temperature= needs a system with baths. Build the system with baths=lt.HeatBaths(...)")
-        velocity = checked_velocity(angular_velocity, rotor_rates, self.algebra.dim, batch)
+        velocity = checked_velocity(angular_velocity, rotor_rates, self.algebra.dim, batch, degrees)
         momentum = self.momentum_of_velocity(velocity, t)
         if temperature is not None:
             y = entropies_of_temperatures(self.baths, temperature)

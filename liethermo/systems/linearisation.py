@@ -370,7 +370,7 @@ def linearise(system: System, x, t: float | None = None) -> Linearisation:
     Raises
     ------
     InputError
-        If x is no equilibrium, or the system depends on time and t is missing.
+        If x is not an equilibrium, or the system depends on time and t is missing.
 
     Examples
     --------

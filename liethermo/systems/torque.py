@@ -99,7 +99,7 @@ def traced_torque_and_argument_counts(
     Raises
     ------
     InputError, FunctionError
-        If it is no function of t, (t, mu), (t, mu, attitude) or (t, mu, attitude, velocity) to a dual vector; or if
+        If it is not a function of t, (t, mu), (t, mu, attitude) or (t, mu, attitude, velocity) to a dual vector; or if
         there is no attitude.
     """
     if given is None:

@@ -55,7 +55,7 @@ def check_equilibrium(
     errors: float = MAX_STANDARD_ERRORS,
     seed: int = 0,
 ) -> Report:
-    """Compare moments of many paths, in the second half of a time span, with moments of the exact measure.
+    """Check that moments of many noisy paths, in the second half of a time span, are those of the exact measure.
 
     The exact measure is ``exp(S / k)`` on the energy level of x0 or, with a bath, ``exp(-H / (k T))`` on the level of a
     Casimir that the noise conserves, if there is one. It is sampled by weighted independent points on random rays from
@@ -110,13 +110,15 @@ def check_equilibrium(
     assert path_ensemble.x is not None
     late_states = path_ensemble.x[:, path_ensemble.t >= 0.5 * time]
     exact_samples = (
-        Samples(*samples) if samples is not None else sample_exact_measure(system, noise, starts[0], late_states, seed)
+        Samples(*samples)
+        if samples is not None
+        else sample_equilibrium_measure(system, noise, starts[0], late_states, seed)
     )
     weights = np.asarray(exact_samples.weights) / np.sum(exact_samples.weights)
     effective_count = 1.0 / np.sum(weights**2)
     if effective_count < MIN_EFFECTIVE_SAMPLES:
         raise ValueError(f"the points of the exact measure count as {effective_count:.0f} alone. Give samples of it")
-    for name, f in (_default_moments(system) if moments is None else moments).items():
+    for name, f in (_default_moment_functions(system) if moments is None else moments).items():
         function = make_energy(f, f"moment {name!r}")
         path_means = (
             evaluate_at_points(energy_value, function, late_states.reshape(-1, system.dim))
@@ -140,8 +142,10 @@ def check_equilibrium(
     return suite.report()
 
 
-def sample_exact_measure(system: System, noise: Fluctuations, x0, path_states: np.ndarray, seed: int = 0) -> Samples:
-    """Return independent weighted points of the exact measure: see :func:`check_equilibrium`.
+def sample_equilibrium_measure(
+    system: System, noise: Fluctuations, x0, path_states: np.ndarray, seed: int = 0
+) -> Samples:
+    """Sample the exact equilibrium measure of :func:`check_equilibrium`; return independent points and their weights.
 
     Parameters
     ----------
@@ -160,13 +164,13 @@ def sample_exact_measure(system: System, noise: Fluctuations, x0, path_states: n
         raise ValueError(
             f"motion and noise conserve {', '.join(invariants)}. If there are several, give samples of the measure"
         )
-    random, n = np.random.default_rng(seed), system.dim
-    directions = random.standard_normal((N_EXACT_SAMPLES, n))
+    rng, n = np.random.default_rng(seed), system.dim
+    directions = rng.standard_normal((N_EXACT_SAMPLES, n))
     if not invariants:
         covariance_root = np.linalg.cholesky(1.5 * np.cov(path_states.reshape(-1, n).T).reshape(n, n))
         points, centre = directions @ covariance_root.T, path_states.reshape(-1, n).mean(axis=0)
-        logs = _log_density(system, noise, points + centre) + 0.5 * np.sum(directions**2, axis=1)
-        return Samples(points + centre, np.exp(logs - logs.max()))
+        log_weights = _log_density(system, noise, points + centre) + 0.5 * np.sum(directions**2, axis=1)
+        return Samples(points + centre, np.exp(log_weights - log_weights.max()))
     (name, F), level = next(iter(invariants.items())), jnp.asarray(x0, dtype=float)
     curvature = np.asarray(jax.hessian(F.value)(jnp.zeros(n)))
     eigenvalues, axes = np.linalg.eigh(curvature)
@@ -176,12 +180,13 @@ def sample_exact_measure(system: System, noise: Fluctuations, x0, path_states: n
     if not (np.isfinite(radius) & (slope > 0.0)).all():
         raise ValueError(f"rays from the origin do not meet the level of {name} once. Give samples of the measure")
     points = radius[:, None] * directions
-    logs = _log_density(system, noise, points) + (n - 1) * np.log(radius) - np.log(slope)
-    return Samples(points, np.exp(logs - logs.max()))
+    log_weights = _log_density(system, noise, points) + (n - 1) * np.log(radius) - np.log(slope)
+    return Samples(points, np.exp(log_weights - log_weights.max()))
 
 
 def _level_distance_and_slope(function_and_level_state: tuple[Energy, jax.Array], direction):
-    """Return the distance to a level along a ray, and the function's outward slope there; NaN if it is not met."""
+    """Return the distance along a ray at which a function reaches a level, and its outward slope; NaN if it does
+    not."""
     F, x0 = function_and_level_state
     level, start = F.value(x0), F.value(jnp.zeros_like(x0))
 
@@ -191,11 +196,11 @@ def _level_distance_and_slope(function_and_level_state: tuple[Energy, jax.Array]
     initial_radius = jnp.linalg.norm(x0) / jnp.linalg.norm(direction)
     outer_radius = jax.lax.fori_loop(0, 40, lambda _, r: jnp.where(is_before_level(r), 2.0 * r, r), initial_radius)
 
-    def bisect(_, ends):
-        inner_end, outer_end = ends
-        middle = 0.5 * (inner_end + outer_end)
-        is_inside = is_before_level(middle)
-        return jnp.where(is_inside, middle, inner_end), jnp.where(is_inside, outer_end, middle)
+    def bisect(_, bracket):
+        inner_end, outer_end = bracket
+        midpoint = 0.5 * (inner_end + outer_end)
+        is_inside = is_before_level(midpoint)
+        return jnp.where(is_inside, midpoint, inner_end), jnp.where(is_inside, outer_end, midpoint)
 
     inner_end, outer_end = jax.lax.fori_loop(0, N_BISECTIONS, bisect, (0.0 * outer_radius, outer_radius))
     slope = jnp.dot(F.gradient(outer_end * direction), direction) * jnp.sign(level - start)
@@ -203,7 +208,7 @@ def _level_distance_and_slope(function_and_level_state: tuple[Energy, jax.Array]
 
 
 def _log_density(system: System, noise: Fluctuations, points: np.ndarray) -> np.ndarray:
-    """Return the logarithm of the density at each point, up to a constant."""
+    """Return the logarithm of the equilibrium density at each point, shape (m,), up to a constant."""
     log_density = np.zeros(len(points))
     if noise.temperature is not None:
         log_density = log_density - evaluate_at_points(energy_value, system.energy, points) / (
@@ -216,7 +221,8 @@ def _log_density(system: System, noise: Fluctuations, points: np.ndarray) -> np.
     return log_density
 
 
-def _default_moments(system: System) -> dict[str, Callable]:
+def _default_moment_functions(system: System) -> dict[str, Callable]:
+    """Return the default moments by name: components, their squares, and the entropy or the energy."""
     moments: dict[str, Callable] = {}
     for i in range(system.dim):
         moments |= {f"x{i + 1}": lambda x, i=i: x[i], f"x{i + 1}^2": lambda x, i=i: x[i] ** 2}

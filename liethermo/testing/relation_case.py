@@ -15,7 +15,7 @@ from ..results.solution import Solution
 from ..runs.adaptive import Adaptive
 from ..runs.integrate import integrate
 from ..systems import System
-from .suites import random_start
+from .suites import random_initial_state
 
 ROUNDING_RTOL = 1e-11
 """Largest difference of states that should differ by rounding alone, relative to the largest state component.
@@ -33,7 +33,7 @@ SkipReason = str | None
 
 
 class RelationCase:
-    """A run, and the comparisons of equivalent runs with it.
+    """A base run, with methods that make equivalent runs and compare them with it.
 
     Parameters
     ----------
@@ -51,7 +51,8 @@ class RelationCase:
         self.suite, self.name = Suite(f"{method} in a {system.kind}"), ""
 
     def run(self, system: System | None = None, x0=None, span=None, step=None, **options) -> Solution:
-        """Integrate like the base run, except for the given arguments; a failed run is returned too."""
+        """Integrate with the arguments of the base run, except for the given ones, and return the run, even if it
+        failed."""
         return integrate(
             self.system if system is None else system,
             self.x0 if x0 is None else x0,
@@ -65,7 +66,7 @@ class RelationCase:
 
     @functools.cached_property
     def base_run(self) -> Solution:
-        """The run with which all others are compared."""
+        """The run with which all other runs of the case are compared."""
         return self.run()
 
     @property
@@ -78,15 +79,15 @@ class RelationCase:
         """The error of the method relative to the state scale, measured with half the step or a hundredth of the
         tolerance."""
         if isinstance(self.step, Adaptive):
-            finer: float | Adaptive = replace(self.step, rtol=0.01 * self.step.rtol, atol=0.01 * self.step.atol)
+            finer_step: float | Adaptive = replace(self.step, rtol=0.01 * self.step.rtol, atol=0.01 * self.step.atol)
         else:
-            finer = 0.5 * self.step
-        return float(np.abs(self.run(step=finer).x[-1] - self.base_run.x[-1]).max()) / self.state_scale
+            finer_step = 0.5 * self.step
+        return float(np.abs(self.run(step=finer_step).x[-1] - self.base_run.x[-1]).max()) / self.state_scale
 
     @property
     def rounding_tolerance(self) -> float:
-        """The allowed rounding error. It also affects adaptive steps, hence the state by a fraction of their
-        tolerance."""
+        """The allowed relative rounding error; with adaptive steps at least a tenth of their tolerance, since rounding
+        changes the steps."""
         return max(ROUNDING_RTOL, 0.1 * self.step.rtol) if isinstance(self.step, Adaptive) else ROUNDING_RTOL
 
     @property
@@ -94,23 +95,24 @@ class RelationCase:
         """The allowed difference of runs that divide the time into different steps."""
         return max(self.rounding_tolerance, RESOLUTION_ERROR_FACTOR * self.method_error)
 
-    def compare_states(self, label: str, states, expected_states, tolerance: float) -> None:
-        """Add a row with the difference of states from the expected ones, relative to the state scale."""
+    def compare_states_with_expected(self, label: str, states, expected_states, tolerance: float) -> None:
+        """Add a row to the report with the largest difference of states from expected ones, relative to the state
+        scale."""
         self.suite.check_small(
             f"{self.name}: {label}", np.asarray(states) - np.asarray(expected_states), self.state_scale, tolerance
         )
 
-    def compare_run(
+    def compare_with_base_run(
         self,
         description: str,
         run: Solution,
         to_base: Callable = lambda x: x,
         tolerance: float | None = None,
-        same_names: bool = True,
+        has_same_names: bool = True,
     ) -> None:
-        """Add rows that compare a run with the base run: status, states, attitude, conserved functions and audit.
+        """Add rows to the report that compare a run with the base run: status, states, attitude, invariants and audit.
 
-        With ``same_names`` the conserved functions must have equal names, otherwise only their number must agree.
+        With ``has_same_names`` the conserved functions must have equal names, otherwise only their number must agree.
         """
         tolerance = self.rounding_tolerance if tolerance is None else tolerance
         label = f"{self.name}: {description}"
@@ -121,30 +123,32 @@ class RelationCase:
         if status[0] != status[1]:
             return
         has_equal_times = len(run.t) == len(self.base_run.t) and not isinstance(self.step, Adaptive)
-        compared = slice(None) if has_equal_times else slice(-1, None)
-        self.compare_states(description, to_base(run.x[compared]), self.base_run.x[compared], tolerance)
+        compared_rows = slice(None) if has_equal_times else slice(-1, None)
+        self.compare_states_with_expected(
+            description, to_base(run.x[compared_rows]), self.base_run.x[compared_rows], tolerance
+        )
         if run.attitude is not None and self.base_run.attitude is not None:
             self.suite.check_equal(
-                f"{label}, attitude", run.attitude[compared], self.base_run.attitude[compared], tolerance
+                f"{label}, attitude", run.attitude[compared_rows], self.base_run.attitude[compared_rows], tolerance
             )
-        names, base_names = conserved_names(run), conserved_names(self.base_run)
-        agree = names == base_names if same_names else len(names) == len(base_names)
+        names, base_names = names_of_conserved_functions(run), names_of_conserved_functions(self.base_run)
+        names_agree = names == base_names if has_same_names else len(names) == len(base_names)
         self.suite.check_true(
-            f"{label}, same constants", agree, "" if agree else f"{sorted(names)}, not {sorted(base_names)}"
+            f"{label}, same constants", names_agree, "" if names_agree else f"{sorted(names)}, not {sorted(base_names)}"
         )
         is_same_verdict = run.audit().passed == self.base_run.audit().passed
         self.suite.check_true(f"{label}, same verdict", is_same_verdict, "" if is_same_verdict else run.audit().verdict)
 
 
-def conserved_names(run: Solution) -> set[str]:
-    """Return the names of the functions that a run conserves, promised or not."""
+def names_of_conserved_functions(run: Solution) -> set[str]:
+    """Return the names of the functions that a run conserves, whether the method promises it or not."""
     return {*run.laws.conserved, *run.laws.unpromised}
 
 
-def nearby_state(case: RelationCase) -> np.ndarray:
-    """Return another state at a twentieth of the state scale, or if that is outside, on the way to a random state."""
-    v = np.random.default_rng(case.seed + 1).standard_normal(case.x0.shape)
-    nearby = case.x0 + 0.05 * case.state_scale * v / np.linalg.norm(v)
-    if not case.system.domain.why_outside(nearby.ravel()):
-        return nearby
-    return case.x0 + 0.05 * (random_start(case.system, case.seed + 1).reshape(case.x0.shape) - case.x0)
+def state_near_initial_state(case: RelationCase) -> np.ndarray:
+    """Return a state inside the domain at about a twentieth of the state scale from the initial state."""
+    direction = np.random.default_rng(case.seed + 1).standard_normal(case.x0.shape)
+    nearby_x = case.x0 + 0.05 * case.state_scale * direction / np.linalg.norm(direction)
+    if not case.system.domain.why_outside(nearby_x.ravel()):
+        return nearby_x
+    return case.x0 + 0.05 * (random_initial_state(case.system, case.seed + 1).reshape(case.x0.shape) - case.x0)

@@ -44,13 +44,13 @@ SUITE_METHODS = (MetriplecticMidpoint(), MetriplecticGauss(2))
 """Methods that integrate the tested systems and dissipations."""
 
 
-def rebuild_pytree(tree):
-    """Return an equal tree built from copies of its leaves, so that no object keeps its identity."""
+def copy_pytree(tree):
+    """Return a pytree that is equal but built from copies of the array leaves, so that no object is shared."""
     leaves, structure = jax.tree_util.tree_flatten(tree)
     return jax.tree_util.tree_unflatten(structure, [jnp.array(a) if isinstance(a, jax.Array) else a for a in leaves])
 
 
-def random_start(system: System, seed: int) -> np.ndarray:
+def random_initial_state(system: System, seed: int) -> np.ndarray:
     """Return a random state inside the domain of the system, shape (n,)."""
     for x in system.samples(20, seed):
         if not system.domain.why_outside(jnp.asarray(x)) and np.isfinite(_field_at_time_zero(system, x)).all():
@@ -58,33 +58,33 @@ def random_start(system: System, seed: int) -> np.ndarray:
     raise ValueError(f"none of 20 random states is inside the domain of this {system.kind}. Give x0")
 
 
-def default_step(system: System, x0) -> float:
-    """Return a step in which the state moves by a hundredth of its norm."""
+def default_step_size(system: System, x0) -> float:
+    """Return a step size with which the state moves by a hundredth of its norm."""
     field_norm, norm = (float(np.linalg.norm(np.asarray(v))) for v in (_field_at_time_zero(system, x0), x0))
     return 0.01 * max(norm, 1e-3) / field_norm if field_norm > 0.0 else 0.01
 
 
 def _field_at_time_zero(system: System, x) -> np.ndarray:
-    """Return the vector field at a state, at time 0 if it depends on time."""
+    """Return the vector field at a state, shape (n,), at time 0 if the system depends on time."""
     return np.asarray(system.vector_field(x, 0.0) if system.is_driven else system.vector_field(x))
 
 
-def check_completion(suite: Suite, label: str, run: Solution) -> None:
-    """Add a row that says if a run reached its end."""
+def check_run_completes(suite: Suite, label: str, run: Solution) -> None:
+    """Add a row to the suite that says whether a run reached its end."""
     suite.check_true(f"{label} completes", run.status.ok, "" if run.status.ok else run.status.message)
 
 
 def check_laws_along_run(suite: Suite, system: System, method: OneStepMethod, x0, h: float, label: str = "") -> None:
-    """Add rows for the audit of a run, the agreement of the engines, and the equality with a rebuilt system's run."""
+    """Run a system and add rows for the audit, the agreement of the engines, and the run of a copied system."""
     solution = integrate(system, x0, (0.0, N_STEPS * h), h, method, on_failure="return", engine="array")
-    check_completion(suite, f"{label}run", solution)
+    check_run_completes(suite, f"{label}run", solution)
     for row in solution.audit().rows:
         if row.passed is not None and row.law not in (STEPS_TAKEN_ROW, ACCURACY_ROW):
             # what the method does not claim to keep is not judged
             passed = None if row.note == INEXACT_LAW_NOTE else row.passed
             suite.rows.append(replace(row, name=f"{label}{row.law}", passed=passed))
     rebuilt_run = integrate(
-        rebuild_pytree(system), x0, (0.0, N_STEPS * h), h, rebuild_pytree(method), on_failure="return", engine="array"
+        copy_pytree(system), x0, (0.0, N_STEPS * h), h, copy_pytree(method), on_failure="return", engine="array"
     )
     is_identical = np.array_equal(solution.x, rebuilt_run.x) and solution.laws == rebuilt_run.laws
     suite.check_true(f"{label}the same to the bit when taken apart and put together", is_identical)
@@ -101,13 +101,13 @@ Problem = tuple[System, object, float]
 """A system, its initial state and the duration of the run."""
 
 
-def problems_for(method: OneStepMethod) -> dict[str, Problem]:
+def accepted_test_problems(method: OneStepMethod) -> dict[str, Problem]:
     """Return the test problems that a method accepts, by name."""
     if method.systems == EVERY_SYSTEM:
-        return general_problems()
+        return body_top_and_oscillator_problems()
     problems = {
         name: problem
-        for name, problem in (closed_system_problems() | density_matrix_problems()).items()
+        for name, problem in (mechanical_and_body_problems() | density_matrix_problems()).items()
         if _accepts_system(method, problem[0])
     }
     if not problems:
@@ -116,6 +116,7 @@ def problems_for(method: OneStepMethod) -> dict[str, Problem]:
 
 
 def _accepts_system(method: OneStepMethod, system: System) -> bool:
+    """Return True if a method can integrate a system."""
     try:
         method.check(system)
     except InputError:
@@ -123,8 +124,8 @@ def _accepts_system(method: OneStepMethod, system: System) -> bool:
     return True
 
 
-def closed_system_problems() -> dict[str, Problem]:
-    """Return problems with special systems: mechanical with heat, isolated and driven, and a rigid body with heat."""
+def mechanical_and_body_problems() -> dict[str, Problem]:
+    """Return test problems by name: mechanical systems with heat, isolated and driven, and a rigid body with heat."""
 
     def lagrangian(q, v, S):
         kinetic = 0.5 * (1.5 + jnp.sin(q[1])) * v[0] ** 2 + 0.6 * v[1] ** 2 + 0.05 * jnp.sum(v**4)
@@ -156,20 +157,20 @@ def closed_system_problems() -> dict[str, Problem]:
 
 
 def density_matrix_problems() -> dict[str, Problem]:
-    """Return two open quantum systems: one of three levels with two jumps, and a driven qubit in its ground state."""
-    lower, sx = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0, 1.0], [1.0, 0.0]])
+    """Return two test problems of open quantum systems, by name: three levels with two jumps, and a driven qubit."""
+    lowering_operator, sx = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0, 1.0], [1.0, 0.0]])
     H = np.array([[0.0, 0.3, 0.1j], [0.3, 0.8, 0.2], [-0.1j, 0.2, 1.5]])
     levels = QuantumSystem(H, LindbladJumps([(np.eye(3, k=1), 0.4), (np.diag([0.0, 1.0, -1.0]), 0.2)]))
     drive = [np.diag([0.0, 1.0]), [sx, lambda t: 0.6 * jnp.cos(1.3 * t)]]
-    qubit = QuantumSystem(drive, LindbladJumps([(lower, lambda t: 0.3 + 0.2 * jnp.sin(t))]))
+    qubit = QuantumSystem(drive, LindbladJumps([(lowering_operator, lambda t: 0.3 + 0.2 * jnp.sin(t))]))
     return {
         "three levels": (levels, levels.state(np.diag([0.2, 0.3, 0.5])), 2.0),
         "driven qubit": (qubit, qubit.state([1.0, 0.0]), 2.0),
     }
 
 
-def general_problems() -> dict[str, Problem]:
-    """Return general problems: a relaxing body, a top with and without friction, and a damped oscillator in R^3."""
+def body_top_and_oscillator_problems() -> dict[str, Problem]:
+    """Return general test problems by name: a relaxing body, a top with and without friction, a damped oscillator."""
     moments = jnp.array([3.0, 2.0, 1.0])
 
     def body(m):
@@ -221,7 +222,7 @@ def check_system(
     methods: Sequence[OneStepMethod] = SUITE_METHODS,
     seed: int = 0,
 ) -> Report:
-    """Check the axioms of a system at random points, and its laws along a run of each method.
+    """Check the axioms of a system at random points, and its laws along a run with each method.
 
     Parameters
     ----------
@@ -242,12 +243,12 @@ def check_system(
     suite = Suite(system.kind)
     suite.rows += system.check(seed=seed).rows
     points = system.samples(3, seed)
-    field, rebuilt_field = (vector_field_at(s, points) for s in (system, rebuild_pytree(system)))
+    field, rebuilt_field = (vector_field_at(s, points) for s in (system, copy_pytree(system)))
     suite.check_true(
         "field to the bit when taken apart and put together", np.array_equal(field, rebuilt_field, equal_nan=True)
     )
-    start = random_start(system, seed) if x0 is None else np.asarray(x0, dtype=np.float64)
-    h = default_step(system, start) if step is None else step
+    start = random_initial_state(system, seed) if x0 is None else np.asarray(x0, dtype=np.float64)
+    h = default_step_size(system, start) if step is None else step
     for method in methods:
         check_laws_along_run(suite, system, method, start, h, f"{method}: ")
     return suite.report()
@@ -268,38 +269,46 @@ def check_dissipation(dissipation: Dissipation | System, algebra: mf.LieAlgebra 
     PropertyError
         If it violates a law that it states, or changes a function that it must preserve.
     """
-    system = dissipation if isinstance(dissipation, System) else _test_system(dissipation, algebra or mf.so(3))
+    system = (
+        dissipation if isinstance(dissipation, System) else _system_with_dissipation(dissipation, algebra or mf.so(3))
+    )
     if system.dissipation is None:
         raise ValueError("the system has no dissipation")
     suite = Suite(f"{type(system.dissipation).__name__} in a {system.kind}")
     random = np.random.default_rng(seed)
     points = [x for x in system.samples(8, seed) if np.isfinite(np.asarray(system.vector_field(x))).all()]
-    tested, max_energy_rate, min_entropy_rate, max_force = system.dissipation, 0.0, 0.0, 0.0
+    tested_dissipation, max_energy_rate, min_entropy_rate, max_force = system.dissipation, 0.0, 0.0, 0.0
     for x in points:
-        dH, dS, *dL = random.standard_normal((2 + len(tested.preserve), system.dim))
+        dH, dS, *dL = random.standard_normal((2 + len(tested_dissipation.preserve), system.dim))
         if system.baths.has_positive_temperatures:
             dH[system.body_dim :] = np.abs(dH[system.body_dim :])  # no gradient has temperatures below zero
         force = np.asarray(
-            tested.force(system, jnp.asarray(x), jnp.asarray(dH), jnp.asarray(dS), tuple(map(jnp.asarray, dL)))
+            tested_dissipation.force(
+                system, jnp.asarray(x), jnp.asarray(dH), jnp.asarray(dS), tuple(map(jnp.asarray, dL))
+            )
         )
         scale = float(np.linalg.norm(force))
         max_energy_rate = max(max_energy_rate, float(abs(force @ dH) / max(scale * np.linalg.norm(dH), 1e-300)))
         min_entropy_rate = min(min_entropy_rate, float((force @ dS) / max(scale * np.linalg.norm(dS), 1e-300)))
         max_force = max(max_force, scale)
-    if tested.energy_law == "conserved" and system.space is None:
+    if tested_dissipation.energy_law == "conserved" and system.space is None:
         suite.check_small("any vector instead of grad H is in the kernel", max_energy_rate, 1.0, 1e-12)
-    if tested.entropy_law == "nondecreasing" and tested.energy_law == "conserved" and system.space is None:
+    if (
+        tested_dissipation.entropy_law == "nondecreasing"
+        and tested_dissipation.energy_law == "conserved"
+        and system.space is None
+    ):
         suite.check_small("the entropy cannot fall, whatever the vectors", min(min_entropy_rate, 0.0), 1.0, 1e-12)
     suite.check_true("it acts", max_force > 0.0)
     suite.rows += system.check(seed=seed).rows
-    x0 = random_start(system, seed)
-    h = default_step(system, x0)
+    x0 = random_initial_state(system, seed)
+    h = default_step_size(system, x0)
     for method in SUITE_METHODS:
         check_laws_along_run(suite, system, method, x0, h, f"{method}: ")
     return suite.report()
 
 
-def _test_system(dissipation: Dissipation, g: mf.LieAlgebra) -> LiePoissonSystem:
+def _system_with_dissipation(dissipation: Dissipation, g: mf.LieAlgebra) -> LiePoissonSystem:
     quadratic = g.casimirs(2)
     if not quadratic:
         raise ValueError(f"{g.name} has no quadratic Casimir. Give a system that has the dissipation")
@@ -325,7 +334,7 @@ def check_method(method: OneStepMethod, systems: Mapping[str, Problem] | None = 
         The method to test.
     systems : dict of (system, x0, time), optional
         Test problems. By default a body and a semidirect product with non-quadratic energies, and an oscillator in R^n;
-        for a method for one kind of system, the matching ones of :func:`problems_for`.
+        for a method for one kind of system, the matching ones of :func:`accepted_test_problems`.
     slack : float
         Largest difference by which an observed order may be below the stated one.
 
@@ -337,7 +346,7 @@ def check_method(method: OneStepMethod, systems: Mapping[str, Problem] | None = 
         If no test problem suits the method.
     """
     suite = Suite(str(method))
-    for name, (system, x0, time) in (problems_for(method) if systems is None else systems).items():
+    for name, (system, x0, time) in (accepted_test_problems(method) if systems is None else systems).items():
         start = np.asarray(x0, dtype=np.float64)
         exact = integrate(system, start, (0.0, time), time, Reference(rtol=3e-14)).x[-1]
         n_coarse = 6 if method.order > 2 else 20

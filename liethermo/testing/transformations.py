@@ -24,7 +24,7 @@ from ..systems.invariants import find_preserved_names
 
 @dataclass(frozen=True)
 class CoordinateChange:
-    """A change to states ``y = A x`` at times ``time_unit * t``, with other units of energy and entropy.
+    """A linear change of coordinates ``y = A x``, with other units of time, energy and entropy.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class CoordinateChange:
 
 
 class _TransformedEnergy(Module):
-    """The energy ``factor * energy(B y)``."""
+    """An energy in the new coordinates, ``factor * energy(B y)``."""
 
     energy: Energy
     matrix: jax.Array
@@ -82,7 +82,7 @@ class _TransformedPoisson(PoissonBySharp):
 
 
 class _TransformedDissipation(LiftedDissipation):
-    """A dissipation in the new coordinates, evaluated in the old ones."""
+    """A dissipation in the new coordinates, which is evaluated in the old coordinates."""
 
     system: System
     matrix: jax.Array
@@ -109,8 +109,8 @@ class _TransformedDissipation(LiftedDissipation):
         return None  # the amplitude of noise would scale differently
 
 
-def transform_system(system: System, change: CoordinateChange) -> System:
-    """Return an equivalent system on R^n in other coordinates and units.
+def transform_coordinates_and_units(system: System, change: CoordinateChange) -> System:
+    """Return a system on R^n that is equivalent to another in other coordinates and units.
 
     A Lie-Poisson system remains one in two cases: with its group if the momentum is scaled uniformly and the energy
     unit is the momentum unit per time unit, and with another basis of its algebra if time and energy keep their units.
@@ -127,8 +127,8 @@ def transform_system(system: System, change: CoordinateChange) -> System:
     maps = {name: transform(J) for name, J in system.momentum_maps.items()}
     if isinstance(system, LiePoissonSystem) and system.dim == system.algebra.dim and not system.sites:
         if change.uniform_factor is not None and change.energy_unit == change.uniform_factor / change.time_unit:
-            parts = (system.algebra, system.group, system.reconstruction)
-            return LiePoissonSystem(parts[0], H, S, friction, maps, False, *parts[1:])
+            attributes = (system.algebra, system.group, system.reconstruction)
+            return LiePoissonSystem(attributes[0], H, S, friction, maps, False, *attributes[1:])
         if change.time_unit == change.energy_unit == 1.0:
             g = mf.LieAlgebra.from_structure_constants(
                 transform_structure_constants(system.algebra.structure_constants, change.matrix)
@@ -141,7 +141,7 @@ def transform_system(system: System, change: CoordinateChange) -> System:
 
 
 def transform_structure_constants(constants: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Return the structure constants in the basis ``sum_i A_ai e_i``, for dual coordinates ``A mu``."""
+    """Return the structure constants of an algebra in the basis ``sum_i A_ai e_i``, with dual coordinates ``A mu``."""
     C = np.einsum("ai,bj,ijk,kc->abc", matrix, matrix, np.asarray(constants), np.linalg.inv(matrix), optimize=True)
     return 0.5 * (C - C.swapaxes(0, 1))
 
@@ -158,7 +158,7 @@ class _ShiftedEnergy(Module):
 
 
 class _LocalFunction(Module):
-    """A function that is NaN, as is its gradient, farther than ``radius`` from the given states."""
+    """A function that is NaN, with its gradient, at distances above ``radius`` from the given states."""
 
     energy: Energy
     states: jax.Array
@@ -171,7 +171,7 @@ class _LocalFunction(Module):
 
 
 def add_constant(energy: Energy, constant: float) -> Energy:
-    """Return the energy with a constant added to its last term."""
+    """Return an energy plus a constant, which is added to the last term."""
     *leading_terms, last_term = energy.terms
     if isinstance(last_term, Quadratic):
         last_term = Quadratic(last_term.A, last_term.b, last_term.c + constant)
@@ -180,32 +180,39 @@ def add_constant(energy: Energy, constant: float) -> Energy:
     return Sum((*leading_terms, last_term)) if leading_terms else last_term
 
 
-def restrict_near_states(energy: Energy, states, radius: float) -> Energy:
-    """Return the function restricted to a radius around some states, shape (m, n); it is NaN elsewhere."""
+def restrict_function_to_neighbourhood(energy: Energy, states, radius: float) -> Energy:
+    """Return a function that is NaN at distances above ``radius`` from all of some states, shape (m, n)."""
     return Function(_LocalFunction(energy, jnp.asarray(states), jnp.asarray(radius), jnp.asarray(1e-300)))
 
 
-def close_over_parameters(energy: Energy) -> Energy:
-    """Return the energy as plain functions that close over its parameters."""
+def hide_parameters_in_closures(energy: Energy) -> Energy:
+    """Return an energy whose terms are plain functions with the parameters as constants in closures."""
     return energy.map_terms(lambda term: term if isinstance(term, Pullback) else Function(lambda x: term.value(x)))
 
 
-def replace_parts(system: System, **parts: Any) -> System:
-    """Return the system with other parts, given by attribute name."""
-    names = list(parts)
-    changed = eqx.tree_at(
-        lambda s: [getattr(s, name) for name in names], system, list(parts.values()), is_leaf=lambda part: part is None
+def replace_system_attributes(system: System, **attributes: Any) -> System:
+    """Return a copy of a system with some attributes replaced, such as ``energy``."""
+    names = list(attributes)
+    changed_system = eqx.tree_at(
+        lambda s: [getattr(s, name) for name in names],
+        system,
+        list(attributes.values()),
+        is_leaf=lambda part: part is None,
     )
-    if "dissipation" in parts:  # the constructor sets these names from the dissipation
-        object.__setattr__(changed, "preserved_labels", find_preserved_names(changed) if changed.preserved else None)
-    return changed
+    if "dissipation" in attributes:  # the constructor sets these names from the dissipation
+        object.__setattr__(
+            changed_system,
+            "preserved_labels",
+            find_preserved_names(changed_system) if changed_system.preserved else None,
+        )
+    return changed_system
 
 
 # -- other dissipations ---------------------------------------------------------------------------------------------
 
 
 class _ScaledDissipation(LiftedDissipation):
-    """A fraction of a dissipation."""
+    """A dissipation multiplied by a fraction."""
 
     fraction: jax.Array
 
@@ -221,8 +228,8 @@ class _ScaledDissipation(LiftedDissipation):
         return None if velocity is None else self.fraction * velocity
 
 
-def sum_of_two_halves(system: System) -> Dissipation:
-    """Return the dissipation of a system as the sum of two with half of the rate each."""
+def split_dissipation_into_halves(system: System) -> Dissipation:
+    """Return the dissipation of a system as the sum of two dissipations with half of the rate each."""
     rate = named_parameters(system).get("dissipation.rate")
     if rate is not None:
         half = replace_parameters(system, {"dissipation.rate": rate / 2}).dissipation

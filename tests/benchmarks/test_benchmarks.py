@@ -15,7 +15,7 @@ from scipy.optimize import brentq
 from benchmarks import child, first_page, laws, native, page, reference, simulators
 from benchmarks.__main__ import RESULT_FOLDER, main
 from benchmarks.contest import max_difference_from_c
-from benchmarks.heat_bath import sample_heat_bath
+from benchmarks.heat_bath import simulate_heisenberg_heat_bath
 from benchmarks.laws import Laws
 from benchmarks.measurements import magnet, manifolds, memory, spin, tumbling, variational
 from benchmarks.native import BodyProgram, EnsembleProgram
@@ -122,7 +122,7 @@ def test_the_statistics_of_the_magnet():
     time = _series(np.column_stack([x, np.sqrt(x - x.min()), np.zeros((n, 2))])).autocorrelation_time  # of m²
     assert abs(time / ((1 + rho) / (2 * (1 - rho))) - 1.0) < 0.2  # 0.06 is its standard error
     rows = np.column_stack([x, x, np.zeros((n, 2))])
-    mean, error = magnet.with_error(lambda s, row_indices: s.energy[row_indices].mean(), _series(rows))
+    mean, error = magnet.value_and_jackknife_error(lambda s, row_indices: s.energy[row_indices].mean(), _series(rows))
     assert 0.5 < error / np.sqrt(2 * time / n) < 1.5
     assert abs(mean) < 4 * error
 
@@ -160,7 +160,7 @@ def test_where_the_cumulants_of_two_lattices_are_equal():
 @pytest.mark.parametrize("T", [10.0, 20.0])
 def test_monte_carlo_of_the_magnet_at_high_temperatures(T):
     """The energy of a bond is Langevin's function of J / kT, up to loops of four bonds."""
-    (rows,) = sample_heat_bath(6, [T], 400)
+    (rows,) = simulate_heisenberg_heat_bath(6, [T], 400)
     energies = rows[:, 0].reshape(20, -1).mean(axis=1)
     exact = -3.0 * (1.0 / np.tanh(1.0 / T) - T)
     assert abs(energies.mean() - exact) < 4 * energies.std() / np.sqrt(19) + 4.0 / (3 * T) ** 3
@@ -177,7 +177,7 @@ def test_the_driver_refuses_unknown_names(capsys):
 def test_c_is_handed_the_library_s_rules():
     header = (native.SOURCE_FOLDER / "rules.h").read_text()
     macros = set(re.findall(r"\b[A-Z_]{4,}\b", "".join(p.read_text() for p in native.SOURCE_FOLDER.glob("*.[ch]"))))
-    for flag in native.solver_definitions():
+    for flag in native.solver_option_macros():
         name, value = flag.removeprefix("-D").split("=")
         assert name in macros
         assert float(value) == getattr(DEFAULT_OPTIONS, name.lower())

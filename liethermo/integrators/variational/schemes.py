@@ -169,11 +169,11 @@ class VariationalIntegrator(OneStepMethod):
                 f"retraction= needs a manifold of positions, and this {system.kind} has none. Leave retraction= out"
             )
         elif (composed := _composed_or_none(system)) is not None:
-            self._check_maps_for_bodies(composed)
+            self._check_maps_for_composed_system(composed)
         else:
             require_simple_closed(system, "VariationalIntegrator")
 
-    def _check_maps_for_bodies(self, system: ComposedSystem) -> None:
+    def _check_maps_for_composed_system(self, system: ComposedSystem) -> None:
         if not (self.phi == self.forces == self.constraint):
             raise InputError(f"for several bodies the maps of forces and constraint must be phi, and {self} has others")
         if any(type(map) is not FiniteDifference for map in self.phi):

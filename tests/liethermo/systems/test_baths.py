@@ -209,3 +209,30 @@ BAD = {
 
 
 test_bad_baths_are_refused = refusal_test(BAD, error=(lt.InputError, lt.FunctionError))
+
+
+def test_one_temperature_has_no_axis_and_several_have_one():
+    one, two = (lt.HeatBaths(capacity=2.0, temperature=temperatures) for temperatures in (3.0, [3.0, 4.0]))
+
+    def spin(baths):
+        return lt.SpinSystem(1, lt.magnetism.zeeman(1, (0, 0, 1.0)), lt.LandauLifshitz(0.1), baths)
+
+    x = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 1.0, 2.0 * np.log(2.0)]])
+    np.testing.assert_allclose(spin(one).temperature(x), [3.0, 6.0], rtol=1e-14)
+    np.testing.assert_allclose(spin(one).temperatures(x), [[3.0], [6.0]], rtol=1e-14)
+    with pytest.raises(lt.InputError, match=r"2 temperatures. Use system.temperatures\(x\), of shape \(..., 2\)"):
+        spin(two).temperature(np.zeros(5))
+    with pytest.raises(lt.InputError, match="no baths"):
+        spin(None).temperature(x[:, :3])
+
+
+def test_systems_with_a_temperature_of_their_own_have_both_forms():
+    gas = lt.EvolutionSystem(lambda x: 0.5 * x[1] ** 2 + jnp.exp(x[2]), 3)
+    x = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, np.log(5.0)]])
+    np.testing.assert_allclose(gas.temperature(x), [1.0, 5.0], rtol=1e-14)
+    np.testing.assert_allclose(gas.temperatures(x), [[1.0], [5.0]], rtol=1e-14)
+    wheels = lt.models.body_with_wheels()
+    y = wheels.state(angular_velocity=(0.1, 0.2, 0.3), temperature=1.7)
+    assert float(wheels.temperature(y)) == pytest.approx(1.7, rel=1e-14)
+    assert wheels.temperatures(y).shape == (1,)
+    assert float(wheels.temperatures(y)[0]) == pytest.approx(1.7, rel=1e-14)

@@ -9,7 +9,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.systems.invariants import conserves, preserved_names
-from liethermo.testing.suites import rebuild_pytree
+from liethermo.testing.suites import copy_pytree
 from liethermo.tracing.interpret import evaluate_at_points
 from tests.cases import DISSIPATIONS, build
 from tests.liethermo.closed_systems import ISOLATED_SYSTEMS
@@ -38,7 +38,7 @@ def _field(system, x):
 @pytest.mark.parametrize("make", [pytest.param(make, id=name) for name, make in system_builders()])
 def test_fields_and_laws(make):
     system = make()
-    again = rebuild_pytree(system)
+    again = copy_pytree(system)
     assert again is not system
     fields = [evaluate_at_points(_field, s, system.samples(3)) for s in (system, again)]
     assert np.array_equal(*fields, equal_nan=True)
@@ -54,7 +54,7 @@ def test_trajectories(name):
     x0 = system.samples(1, scale=0.5)[0]
     runs = [
         lt.integrate(s, x0, (0.0, 0.5), 0.05, lt.MetriplecticGauss(2), engine="array")
-        for s in (system, rebuild_pytree(system))
+        for s in (system, copy_pytree(system))
     ]
     assert np.array_equal(runs[0].x, runs[1].x)
     assert runs[0].laws == runs[1].laws
@@ -62,7 +62,7 @@ def test_trajectories(name):
 
 def test_a_sum_keeps_what_every_part_is_told_to_preserve():
     """Also where both parts are told so, and after the sum is taken apart."""
-    system = rebuild_pytree(SYSTEMS["sum of frictions"]())
+    system = copy_pytree(SYSTEMS["sum of frictions"]())
     length = lambda x: jnp.dot(x[3:], x[3:])  # noqa: E731
     assert conserves(system, (lt.Function(length),)) == [True]
     assert {"mu4**2 + mu5**2 + mu6**2"} == system.first_integrals()  # one quantity, one name
@@ -79,7 +79,7 @@ def test_a_sum_with_one_part_that_preserves_is_consistent():
 
     L = lambda m: m[0] + 0.3 * m[1] ** 2  # noqa: E731
     friction = lt.ProjectedMetric(preserve=(L,), normalized=True, rate=0.3) + lt.ProjectedMetric(rate=0.2)
-    system = rebuild_pytree(lt.LiePoissonSystem(mf.so(3), energy, lambda m: jnp.log(1.0 + jnp.dot(m, m)), friction))
+    system = copy_pytree(lt.LiePoissonSystem(mf.so(3), energy, lambda m: jnp.log(1.0 + jnp.dot(m, m)), friction))
     method, x = lt.MetriplecticGauss(1).on(system), jnp.array([0.8, 0.5, 0.9])
     field = system.vector_field(x)
     slopes = method.slopes(system, x, jnp.zeros(3), 1e-6, field[None])[0]

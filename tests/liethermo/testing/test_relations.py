@@ -14,7 +14,11 @@ from liethermo import testing
 from liethermo.integrators import fluctuating
 from liethermo.integrators.base import has_error_estimate
 from liethermo.runs.schedule import StepSchedule
-from liethermo.testing.transformations import CoordinateChange, transform_structure_constants, transform_system
+from liethermo.testing.transformations import (
+    CoordinateChange,
+    transform_coordinates_and_units,
+    transform_structure_constants,
+)
 from tests.cases import DISSIPATIONS, REPRESENTATIVE, build, state_of
 
 METHODS = {
@@ -147,7 +151,7 @@ def test_another_basis_is_another_algebra():
     inertia = np.array([3.0, 2.0, 1.0])
     body = lt.LiePoissonSystem(mf.so(3), lt.Quadratic(1 / inertia))
     matrix = np.array([[2.0, 1.0, 0.0], [0.0, 1.0, -1.0], [0.5, 0.0, 1.0]])
-    new = transform_system(body, CoordinateChange(matrix, 1.0, 1.0))
+    new = transform_coordinates_and_units(body, CoordinateChange(matrix, 1.0, 1.0))
     mu = np.array([0.3, -0.7, 0.5])
     np.testing.assert_allclose(new.vector_field(matrix @ mu), matrix @ np.cross(mu, mu / inertia), atol=1e-14)
     C = transform_structure_constants(mf.so(3).structure_constants, matrix)
