@@ -17,7 +17,7 @@ from manifolds.matrices.linear import adjoint
 from ..dissipation.lindblad import LindbladJumps
 from ..errors import InputError
 from ..systems import QuantumSystem, System
-from ..systems.kinds import require_kind, user_system
+from ..systems.kind_checks import require_kind, user_system
 from .base import OneStepMethod, register
 from .explicit import StepRow
 from .runge_kutta import END_SLOPE_ROW, hermite_cubic_weights

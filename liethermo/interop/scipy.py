@@ -20,7 +20,7 @@ from ..runs.events import EventSpecification, event_direction, event_terminal
 from ..runs.integrate import integrate, solution_without_steps
 from ..runs.schedule import clip_times_to_span
 from ..systems import System
-from ..systems.kinds import require_system
+from ..systems.kind_checks import require_system
 
 __all__ = ["OdeResult", "solve_ivp"]
 __dir__ = public_dir(__all__)

@@ -14,7 +14,7 @@ from ..errors import FunctionError, InputError
 from ..runs.flow import system_with_parameters
 from ..runs.named_parameters import find_parameter
 from ..systems import System
-from ..systems.kinds import require_system
+from ..systems.kind_checks import require_system
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from .losses import ParameterVector
 from .observation import entry_names

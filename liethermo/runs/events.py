@@ -19,7 +19,7 @@ from ..engines.adaptive_runs import EventOccurrence, EventRules
 from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..results.events import Events, EventSeries
 from ..systems import System
-from ..systems.kinds import user_system
+from ..systems.kind_checks import user_system
 from ..tracing.numpy_calls import PythonCall, accept_jax_arrays
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import trace_callables

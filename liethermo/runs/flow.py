@@ -34,7 +34,7 @@ from ..functions.time_span import DeclaredTimes
 from ..integrators import OneStepMethod
 from ..systems import System
 from ..systems.clock import system_of_step
-from ..systems.kinds import require_system
+from ..systems.kind_checks import require_system
 from ..tracing.programs import jit_cached, jit_unoptimised
 from .adaptive import Adaptive
 from .flow_derivatives import implicit_solution, state_derivatives

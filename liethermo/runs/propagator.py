@@ -21,7 +21,7 @@ from ..integrators import OneStepMethod, Reference
 from ..results.ensemble import Ensemble
 from ..results.solution import Solution
 from ..systems import System
-from ..systems.kinds import require_system
+from ..systems.kind_checks import require_system
 from ..tracing.caching import LRUCache
 from ..tracing.scalarize import UnsupportedPrimitive
 from .adaptive import Adaptive

@@ -19,7 +19,7 @@ from ..integrators import OneStepMethod
 from ..results.solution import Solution
 from ..systems import System
 from ..systems.invariants import stack_gradients
-from ..systems.kinds import require_system
+from ..systems.kind_checks import require_system
 from ..systems.linearisation import conserved_functions, counter_components
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.programs import jit_unoptimised

@@ -18,7 +18,7 @@ from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
 from ..errors import InputError, LiethermoError
 from ..models.inertia import are_inertia_tensors
 from ..systems import System
-from ..systems.kinds import require_system
+from ..systems.kind_checks import require_system
 from ..tracing.caching import fingerprint
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.traced import TracedFunction, trace_function

@@ -17,7 +17,7 @@ from ..functions.conditions import collect_conditions, condition_message
 from ..runs.named_parameters import find_parameter, lookup_parameter, named_parameters, replace_parameters
 from ..runs.system_family import Family
 from ..systems import System
-from ..systems.kinds import require_system
+from ..systems.kind_checks import require_system
 
 FIXED_BATCH_SIZE = 8192
 """Points per call of a compiled program, constant so that results do not depend on the position in a batch."""

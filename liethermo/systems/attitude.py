@@ -23,7 +23,7 @@ from .base import System
 from .clock import Clock
 from .driven import DrivenSystem
 from .interface import EngineHints, WrappedSystem
-from .kinds import require_kind, user_system
+from .kind_checks import require_kind, user_system
 from .lie_poisson import LiePoissonSystem
 from .lifted import LiftedSystem
 from .rotations import attitude_array

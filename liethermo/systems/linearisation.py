@@ -24,7 +24,7 @@ from ..tracing.interpret import evaluate_at_points
 from .base import System
 from .conservation import dissipation_keeps_casimirs
 from .invariants import resolve_invariants_near, stack_gradients, systems_at_test_times
-from .kinds import require_system
+from .kind_checks import require_system
 from .leaf_stability import has_definite_integral, retract
 
 REST_RTOL = 1e-7

@@ -9,7 +9,7 @@ import numpy as np
 from manifolds.matrices.linear import inverse
 
 from ...systems import ComposedSystem, System
-from ...systems.kinds import require_kind
+from ...systems.kind_checks import require_kind
 from ..base import MethodWrapper
 from .discrete import FiniteDifference
 

@@ -19,7 +19,7 @@ from ...errors import InputError
 from ...functions.conditions import require_condition
 from ...functions.newton import newton_correction, newton_iterate
 from ...systems import EulerPoincareClosedSystem, System
-from ...systems.kinds import require_kind
+from ...systems.kind_checks import require_kind
 from ...tracing.programs import jit_cached
 from ..base import (
     WHY_FIXED_VARIATIONAL_STEP,

@@ -16,7 +16,7 @@ import manifolds as mf
 from ...errors import InputError
 from ...functions.conditions import checked_numbers
 from ...systems import ComposedSystem, EmbeddedSystem, SimpleClosedSystem, System
-from ...systems.kinds import require_kind, user_system
+from ...systems.kind_checks import require_kind, user_system
 from ...tracing.programs import jit_cached
 from ..base import (
     WHY_FIXED_VARIATIONAL_STEP,

@@ -24,7 +24,7 @@ from scipy.ndimage import map_coordinates
 from ...errors import InputError
 from ...systems import QuantumSystem, System
 from ...systems.invariants import recorded_functions_with_verdicts
-from ...systems.kinds import require_kind
+from ...systems.kind_checks import require_kind
 from ..solution import Solution
 from .figures import BLUE, DPI, GREY, ORANGE, RED, checked_figure_path, save_figure
 
