@@ -97,7 +97,7 @@ def replace_parameters(system: System, values: Mapping[str, Any]) -> System:
 
 
 class ParameterCondition(NamedTuple):
-    """What the constructor of an object requires of the values of one of its fields, and new values have to meet.
+    """A condition of a constructor on the values of a field, which new values have to meet.
 
     Attributes
     ----------
