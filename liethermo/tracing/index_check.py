@@ -1,7 +1,7 @@
 """Detection of constant indices out of range, with which JAX goes on silently.
 
-JAX reads ``m[2]`` for ``m[3]`` of three components, drops ``m.at[3].set(0.0)``, and reads NaN for ``jnp.take(m, 3)``. The
-indices are found in a jaxpr before anything is computed. An access that states how it treats an index out of range,
+JAX reads ``m[2]`` for ``m[3]`` of three components, drops ``m.at[3].set(0.0)``, and reads NaN for ``jnp.take(m, 3)``.
+The indices are found in a jaxpr before anything is computed. An access that states how it treats an index out of range,
 such as ``x.at[3].get(mode="fill")``, ``mode="clip"`` or ``mode="drop"``, is not checked, nor are computed indices.
 """
 
