@@ -97,7 +97,7 @@ def replace_parameters(system: System, values: Mapping[str, Any]) -> System:
 
 
 class ParameterCondition(NamedTuple):
-    """Condition that the constructor of an object sets on the values of a field, and that new values must meet.
+    """A condition of a constructor on the values of a field, which new values have to meet.
 
     Attributes
     ----------

@@ -1,6 +1,6 @@
 """Detection of constant indices out of range, which JAX does not report.
 
-If m has three components, ``m[3]`` reads ``m[2]``, ``m.at[3].set(0.0)`` changes nothing, and ``jnp.take(m, 3)`` is NaN.
+JAX reads ``m[2]`` for ``m[3]`` of three components, drops ``m.at[3].set(0.0)``, and reads NaN for ``jnp.take(m, 3)``.
 The indices are found in a jaxpr before anything is computed. An access that states how it treats an index out of range,
 such as ``x.at[3].get(mode="fill")``, ``mode="clip"`` or ``mode="drop"``, is not checked, nor are computed indices.
 """
@@ -138,8 +138,7 @@ def _called_jaxpr_and_constants(eqn) -> tuple[Jaxpr, Sequence]:
 
 def _calls_function_of_jax(eqn) -> bool:
     """Return whether an equation calls a function that JAX defines, not one of the user's that is jitted."""
-    debug_info = getattr(_called_jaxpr_and_constants(eqn)[0], "debug_info", None)
-    filename = getattr(debug_info, "func_filename", None)
+    filename = _called_jaxpr_and_constants(eqn)[0].debug_info.func_filename
     return filename is not None and not is_user_file(Path(filename))
 
 
