@@ -116,7 +116,7 @@ class IterationState(NamedTuple):
         is_finite = jnp.isfinite(self.update)
         at_plateau = self.is_update_at_rounding_plateau(scale, options)
         # From a state at rest the updates of a stiff system begin below the limit, and stall there without a plateau.
-        is_rounding = (self.smallest_update <= options.min_contraction * self.first_update) | (
+        is_rounding = (self.update <= options.min_contraction * self.first_update) | (
             self.update <= options.rounding_rtol * scale
         )
         return at_plateau & is_rounding & is_finite, ~at_plateau & ~is_slow & is_finite & (

@@ -29,7 +29,7 @@ REST_RTOL = 4.0 * float(np.finfo(np.float64).eps)
 """Length of a step, relative to the state, below which it is rounding: its gradients are not corrected along it."""
 
 
-DEFECT_RTOL = 4.0 * float(np.finfo(np.float64).eps)
+DEFECT_RTOL = float(np.finfo(np.float64).eps)
 """Defect of the entropy in a step, relative to the length of its gradient and of the state, that is not corrected."""
 
 
