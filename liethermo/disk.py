@@ -24,10 +24,16 @@ STALE_PART_SECONDS = 86_400.0
 PART_NAME_PATTERN = re.compile(r"\.[0-9a-f]{12}\.([0-9a-f]{8})\.(\d+)\.[0-9a-f]{16}\.part")
 """Names of partial files: digests of the final name and of the host, process id, and a random number."""
 
-EXCLUSIVE_WRITE_FLAGS = (
-    os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
-)
+SAFE_OPEN_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
+"""Flags that refuse to open a link, and close the file in child processes; 0 where the operating system has none."""
+
+EXCLUSIVE_WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | SAFE_OPEN_FLAGS
 """Flags that create a new file, and neither overwrite a file nor follow a link."""
+
+
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def write_atomically(path: Path, data: bytes | memoryview, mode: int = 0o666) -> None:

@@ -160,7 +160,7 @@ def quantity_in_si(text: str) -> float:
     Raises
     ------
     InputError
-        If it is no number with a known unit.
+        If it is not a number with a known unit.
     """
     match = QUANTITY_PATTERN.fullmatch(text)
     if match is None:

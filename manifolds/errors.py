@@ -85,7 +85,7 @@ class ClosureError(LieAlgebraError):
 
 
 class RepresentationError(LieAlgebraError):
-    """Raised when matrices ``rho_a`` are no representation: ``[rho_a, rho_b] != rho([e_a, e_b])``."""
+    """Raised when matrices ``rho_a`` are not a representation: ``[rho_a, rho_b] != rho([e_a, e_b])``."""
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:

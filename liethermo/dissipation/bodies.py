@@ -323,11 +323,11 @@ class MatterExchange(Dissipation):
         self.processes = tuple(processes)
 
     def force(self, system, x, dH, dS, dL):
-        affinities, apply_fluxes = self._affinity_and_velocity_maps(system, x, dH)
+        affinities, apply_fluxes = self._affinity_and_force_maps(system, x, dH)
         return apply_fluxes(self._flux_coefficients(x) * affinities(dS))
 
     def factor(self, system, x, dH, dL):
-        _, apply_fluxes = self._affinity_and_velocity_maps(system, x, dH)
+        _, apply_fluxes = self._affinity_and_force_maps(system, x, dH)
         root = jnp.sqrt(self._flux_coefficients(x))
         return Factor(len(self.processes), lambda w: apply_fluxes(root * w))
 
@@ -337,7 +337,7 @@ class MatterExchange(Dissipation):
         L = jnp.stack([jnp.asarray(value) for value in coefficients])
         return jnp.where(L >= 0.0, L, jnp.nan)
 
-    def _affinity_and_velocity_maps(self, system, x, dH) -> tuple[Callable, Callable]:
+    def _affinity_and_force_maps(self, system, x, dH) -> tuple[Callable, Callable]:
         """Return two functions: from dS to ``z_e . dS`` of each process, and from fluxes to ``sum_e flux_e z_e``."""
         stoichiometry, heat_shares, entropy_transport = (
             np.array([getattr(e, name) for e in self.processes])

@@ -106,6 +106,7 @@ class DoubleBracket(Damping):
 
 
 def _checked_metric(metric) -> Any:
+    """Return a metric, a matrix or the diagonal of one, as a linear map; raise InputError unless it is semidefinite."""
     if np.ndim(metric) != 1:
         return checked_semidefinite(metric, "the metric")
     entries = checked_numbers(metric, "the metric")
@@ -176,7 +177,7 @@ class InnerProductDissipation(BracketDissipation):
         return self.K @ bracket_dH_dS
 
     def factor(self, system, x, dH, dL):
-        return _bracket_factor(system, dH, self.K)
+        return _bracket_dissipation_factor(system, dH, self.K)
 
 
 class KillingDissipation(BracketDissipation):
@@ -244,11 +245,11 @@ class KillingDissipation(BracketDissipation):
         return self.rate * (self.form @ bracket_dH_dS)
 
     def factor(self, system, x, dH, dL):
-        factor = _bracket_factor(system, dH, self.form)
+        factor = _bracket_dissipation_factor(system, dH, self.form)
         return None if factor is None else factor.scale_by(self.rate)
 
 
-def _bracket_factor(system, dH, form) -> Factor | None:
+def _bracket_dissipation_factor(system, dH, form) -> Factor | None:
     """Return the factor of ``ad*_dH 𝒦 ad_dH``, whose columns have divergence zero; None if 𝒦 has no known root.
 
     C is skew in a, b: ``div ad*_dH F = C[a, b, c] H_ab F_c`` vanishes.
@@ -375,6 +376,7 @@ class KulkarniNomizu(Dissipation):
 
 
 def _check_semidefinite_on_pairs(form) -> None:
+    """Raise IndefiniteError if the form of a 4-bracket on pairs of covectors has a negative eigenvalue."""
     if isinstance(form, jax.core.Tracer):
         return
     min_eigenvalue, scale = float(np.linalg.eigvalsh(np.asarray(form))[0]), float(np.abs(form).max())
@@ -388,6 +390,7 @@ def _check_semidefinite_on_pairs(form) -> None:
 
 
 def _check_curvature_symmetries(R) -> None:
+    """Raise InputError unless R has the symmetries of an algebraic curvature tensor."""
     if isinstance(R, jax.core.Tracer):
         return
     R = np.asarray(R)

@@ -15,6 +15,9 @@ from ..functions.conditions import checked_numbers, require_condition
 from ..functions.indices import Indices
 from .geometry import Geometry
 
+NEGATIVE_RATE_MESSAGE = "a dissipation rate must be >= 0, got {value}: a negative rate would lower the entropy"
+"""Message for a rate that is negative or NaN."""
+
 NEGATIVE_EIGENVALUE_MESSAGE = (
     "has the negative eigenvalue {value:.3g}: it must be positive semidefinite, or entropy would fall"
 )
@@ -41,11 +44,7 @@ def state_shape_dtype(dim: int):
 def checked_rate(rate) -> jax.Array:
     """Return a rate as one nonnegative number (or a traced one)."""
     array = checked_numbers(rate, "a rate", ())
-    require_condition(
-        array,
-        lambda rate: rate >= 0.0,
-        "a dissipation rate must be >= 0, got {value}: a negative rate would lower the entropy",
-    )
+    require_condition(array, lambda rate: rate >= 0.0, NEGATIVE_RATE_MESSAGE)
     return array
 
 
@@ -54,7 +53,7 @@ def checked_rates(rates) -> jax.Array:
     array = checked_numbers(rates, "a rate")
     if not isinstance(array, jax.core.Tracer) and not np.all(np.asarray(array) >= 0.0):
         min_rate = float(np.asarray(array).min())
-        raise InputError(f"a dissipation rate must be >= 0, got {min_rate}: a negative rate would lower the entropy")
+        raise InputError(NEGATIVE_RATE_MESSAGE.format(value=min_rate))
     return array
 
 

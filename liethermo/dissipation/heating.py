@@ -68,7 +68,7 @@ class Heating(LiftedDissipation):
         B = self.inner.factor(body, x[:n], dH[:n], tuple(L[:n] for L in dL))
         if B is None:
             return None
-        T = self.values_at_sites(dH[n:])
+        T = self.bath_values_at_sites(dH[n:])
         scale = sqrt_or_zero(self.temperature_signs(dH[n:]) * T)
 
         def times(w):
@@ -87,12 +87,12 @@ class Heating(LiftedDissipation):
         assert B is not None
         if self.has_site_baths and not B.solenoidal:  # each site has a temperature of its own
             return super().divergence(system, x)
-        T = jnp.abs(self.values_at_sites(dH[n:]))
+        T = jnp.abs(self.bath_values_at_sites(dH[n:]))
         body_divergence = jnp.zeros(B.size) if B.solenoidal else jnp.sqrt(T) * self.inner.divergence(body, x[:n])
         slopes = temperature_derivatives_by_entropy(system.energy, x, n)
         if slopes is None:
             return body_divergence
-        ratio = jnp.where(T > 0.0, 0.5 * self.values_at_sites(slopes) / jnp.where(T > 0.0, T, 1.0) ** 1.5, 0.0)
+        ratio = jnp.where(T > 0.0, 0.5 * self.bath_values_at_sites(slopes) / jnp.where(T > 0.0, T, 1.0) ** 1.5, 0.0)
         return body_divergence + B.transpose_times(body.heating_sites.scale(ratio, dH[:n]))
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
@@ -111,7 +111,7 @@ class Heating(LiftedDissipation):
         """
         if self.has_positive_temperatures:
             return jnp.ones(np.shape(self.bath)).ravel() if self.has_site_baths else jnp.ones(())
-        return jnp.where(self.values_at_sites(T) < 0.0, -1.0, 1.0)
+        return jnp.where(self.bath_values_at_sites(T) < 0.0, -1.0, 1.0)
 
     def entropy_rates(self, energy_loss, T) -> jax.Array:
         """Return the growth rates of the bath entropies, shape (m,), from the energy lost, shape () or (sites,)."""
@@ -122,16 +122,20 @@ class Heating(LiftedDissipation):
     def _effective_energy_gradient(self, body: Geometry, dH, dS, body_dim: int) -> jax.Array:
         """Return the gradient that replaces dH in the force on the body, shape (n,): dH for the bath entropy."""
         T, dS_y, sign = (
-            self.values_at_sites(dH[body_dim:]),
-            self.values_at_sites(dS[body_dim:]),
+            self.bath_values_at_sites(dH[body_dim:]),
+            self.bath_values_at_sites(dS[body_dim:]),
             self.temperature_signs(dH[body_dim:]),
         )
         scale = body.heating_sites.scale
         return scale(sign, scale(dS_y, dH[:body_dim]) - scale(T, dS[:body_dim]))
 
-    def values_at_sites(self, values) -> jax.Array:
+    def bath_values_at_sites(self, bath_values) -> jax.Array:
         """Return values of baths, shape (m,), at the sites that heat them, shape () or (sites,)."""
-        return values[np.asarray(self.bath).ravel()] if self.has_site_baths else values[int(np.asarray(self.bath))]
+        return (
+            bath_values[np.asarray(self.bath).ravel()]
+            if self.has_site_baths
+            else bath_values[int(np.asarray(self.bath))]
+        )
 
     def _append_entropy_rates(self, body: Geometry, v, dH, body_dim: int) -> jax.Array:
         """Return the velocity v of the body, shape (n,), followed by the entropy rates from the energy it loses."""
@@ -188,6 +192,7 @@ def _couple_term_to_baths(
     has_positive_temperatures: bool,
     pullback: Callable[[Energy], Energy],
 ) -> Dissipation:
+    """Return one summand of a body's dissipation in the system with baths; it heats a bath if it lowers the energy."""
     functions = tuple(map(pullback, term.preserve))
     if term.energy_law != "nonincreasing":
         return HeatlessDissipation(term, functions)

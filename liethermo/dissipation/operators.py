@@ -11,7 +11,7 @@ from manifolds.matrices.linear import adjoint
 from manifolds.structures.poisson import ProductPoisson
 
 from ..errors import InputError
-from ..functions.density import choose_reference_level
+from ..functions.density import lower_level_of_smallest_gap
 from ..functions.gradients import EPS
 from ..functions.indices import StaticArray
 from .geometry import Geometry
@@ -83,7 +83,7 @@ def is_hermitian(V) -> bool:
 
 def subtract_common_energy(H: np.ndarray) -> np.ndarray:
     """Return a Hamiltonian less the energy that all levels have in common."""
-    return H - choose_reference_level(np.diag(H).real) * np.eye(len(H))
+    return H - lower_level_of_smallest_gap(np.diag(H).real) * np.eye(len(H))
 
 
 def level_gap_rounding(H: np.ndarray) -> float:

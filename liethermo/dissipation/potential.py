@@ -85,7 +85,9 @@ class DissipationPotential(Dissipation):
     def bind_to(self, system):
         bound_potential = eqx.tree_at(lambda d: d.of, self, self.of.bind_to(system))
         shape = checked_result_shapes(
-            lambda x: bound_potential.psi_at_state(x)(jnp.zeros(bound_potential._base_factor_at_state(system, x).size)),
+            lambda x: bound_potential.psi_at_state(x)(
+                jnp.zeros(bound_potential._inner_factor_at_state(system, x).size)
+            ),
             state_shape_dtype(system.dim),
         )
         if shape.shape != ():
@@ -99,7 +101,7 @@ class DissipationPotential(Dissipation):
     def input_residuals(self, system, x):
         """Return relative residuals of two conditions on the potential: it is convex, and least at zero force."""
         slope = jax.grad(self.psi_at_state(x))
-        size = self._base_factor_at_state(system, x).size
+        size = self._inner_factor_at_state(system, x).size
         pairs = np.random.default_rng(0).standard_normal((CONVEXITY_PAIRS, 2, size))
         pairs = np.concatenate([scale * pairs for scale in CONVEXITY_FORCE_SCALES])
 
@@ -117,14 +119,14 @@ class DissipationPotential(Dissipation):
         }
 
     def force(self, system, x, dH, dS, dL):
-        B = self._base_factor(system, x, dH, dL)
+        B = self._inner_factor(system, x, dH, dL)
         return B.times(jax.grad(self.psi_at_state(x))(B.transpose_times(dS)))
 
-    def _base_factor_at_state(self, system, x) -> Factor:
+    def _inner_factor_at_state(self, system, x) -> Factor:
         """Return the factor of the underlying dissipation for the exact gradients at x."""
-        return self._base_factor(system, x, system.energy.gradient(x), tuple(L.gradient(x) for L in self.preserve))
+        return self._inner_factor(system, x, system.energy.gradient(x), tuple(L.gradient(x) for L in self.preserve))
 
-    def _base_factor(self, system, x, dH, dL) -> Factor:
+    def _inner_factor(self, system, x, dH, dL) -> Factor:
         """Return the factor of the underlying dissipation; raise InputError if it has none."""
         B = self.of.factor(system, x, dH, dL)
         if B is None:

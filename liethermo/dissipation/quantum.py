@@ -202,7 +202,10 @@ class ThermalJumps(Dissipation):
         """
         structure, n = system.structure, system.body_dim
         rho, H, A = (self._to_jump_frame(structure.matrix(a[:n])) for a in (x, dH, dS))
-        operators, logs = _stack_jump_operators(self.jumps), matrix_logarithm(rho)
+        # In the basis of the system, as in dS: the logarithms of eigenvalues near zero are rounded by up to 50, and
+        # differently in another basis.
+        logs = self._to_jump_frame(matrix_logarithm(structure.matrix(x[:n])))
+        operators = _stack_jump_operators(self.jumps)
         V, V_adjoint, omega = (
             jnp.asarray(operators),
             jnp.asarray(adjoint(operators)),

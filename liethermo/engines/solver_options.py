@@ -53,6 +53,9 @@ class SolverOptions:
         Largest relative update at which a stalled iteration counts as converged. Rounding in the vector field leaves a
         few eps; a condition number of 100 is allowed for. Near an equilibrium at the origin ``|x|/h + |k|`` vanishes,
         but not the terms that cancel in k: there the residual is compared with the rounding scale of the slopes.
+    rounding_rtol, min_contraction : float
+        A fixed-point iteration that stalls has converged if its update, relative to the state, is at most the first, or
+        if its updates have shrunk by the second. Otherwise Newton's method decides.
     projection_rtol : float
         Largest constraint residual of an explicit step, relative to its length. A step with a larger one has not been
         projected, even if the residual is below the rounding of the state: near an equilibrium, where gradients are
@@ -82,6 +85,8 @@ class SolverOptions:
     stall_ratio: float = 0.8
     update_floor: float = 1e-5 * EPS
     plateau_rtol: float = 1e3 * EPS
+    rounding_rtol: float = 16.0 * EPS
+    min_contraction: float = 1e-2
     projection_rtol: float = LEVEL_RTOL_OF_STEP
     projection_state_rtol: float = LEVEL_RTOL_OF_STATE
     tiny: float = 1e-280

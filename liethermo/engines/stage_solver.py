@@ -57,18 +57,22 @@ class IterationState(NamedTuple):
     previous_update: jax.Array
     earlier_update: jax.Array  # the update before the previous one; 0 if there is none
     n_iterations: jax.Array
+    first_update: jax.Array
 
     @classmethod
     def initial(cls, k) -> IterationState:
         infinite, zero_count = jnp.asarray(jnp.inf), jnp.zeros((), dtype=jnp.int64)
-        return cls(k, infinite, infinite, zero_count, infinite, jnp.zeros(()), zero_count)
+        return cls(k, infinite, infinite, zero_count, infinite, jnp.zeros(()), zero_count, infinite)
 
     def next_state(self, k, options: SolverOptions) -> IterationState:
         update = options.norm_for_dim(k.shape[-1])(k - self.k)
         earlier_update = jnp.where(self.n_iterations > 1, self.previous_update, 0.0)
         n_stalled = jnp.where(update < options.stall_ratio * self.smallest_update, 0, self.n_stalled + 1)
         smallest_update = jnp.where(update < self.smallest_update, update, self.smallest_update)
-        return IterationState(k, update, smallest_update, n_stalled, self.update, earlier_update, self.n_iterations + 1)
+        first_update = jnp.where(self.n_iterations == 0, update, self.first_update)
+        return IterationState(
+            k, update, smallest_update, n_stalled, self.update, earlier_update, self.n_iterations + 1, first_update
+        )
 
     def shrinks_slower_than(self, rate: float) -> jax.Array:
         """Return whether updates shrink by less than ``rate``, in the last iteration and in the last two together.
@@ -111,7 +115,11 @@ class IterationState(NamedTuple):
         )
         is_finite = jnp.isfinite(self.update)
         at_plateau = self.is_update_at_rounding_plateau(scale, options)
-        return at_plateau & is_finite, ~at_plateau & ~is_slow & is_finite & (
+        # From a state at rest the updates of a stiff system begin below the limit, and stall there without a plateau.
+        is_rounding = (self.smallest_update <= options.min_contraction * self.first_update) | (
+            self.update <= options.rounding_rtol * scale
+        )
+        return at_plateau & is_rounding & is_finite, ~at_plateau & ~is_slow & is_finite & (
             self.n_iterations < options.max_fixed_point_iterations
         )
 

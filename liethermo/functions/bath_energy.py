@@ -42,7 +42,7 @@ class BathEnergy(Energy):
     temperature: jax.Array
 
     def value(self, x) -> jax.Array:
-        return jnp.sum(self.temperature * _exponential_and_quotient(x * self.rate)[1] * x)
+        return jnp.sum(self.temperature * _exp_and_expm1_quotient(x * self.rate)[1] * x)
 
     def gradient(self, x) -> jax.Array:
         return self.temperature * jnp.exp(x * self.rate)
@@ -52,12 +52,12 @@ class BathEnergy(Energy):
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         """Return the difference quotient of each bath, the only discrete gradient of a function of one number."""
-        return self.gradient(x + compensation) * _exponential_and_quotient(d * self.rate)[1]
+        return self.gradient(x + compensation) * _exp_and_expm1_quotient(d * self.rate)[1]
 
     def stage_gradients(self, scheme, path) -> jax.Array:
         start, k, h, b = path.start + path.compensation, path.slopes, path.h, path.b
         displacements = jnp.concatenate([path.points - start, path.step[None]])
-        exponentials, quotients = _exponential_and_quotient(displacements * self.rate)
+        exponentials, quotients = _exp_and_expm1_quotient(displacements * self.rate)
         start_gradient = self.gradient(start)
         gradients, change = start_gradient * exponentials[:-1], start_gradient * quotients[-1] * path.step
         defect, squared_norm = change - h * (b @ (gradients * k)), h * (b @ (k * k))
@@ -66,7 +66,7 @@ class BathEnergy(Energy):
 
     @property
     def rate(self) -> jax.Array:
-        """Relative change of a temperature per entropy, 1 / C, shape (m,)."""
+        """Inverse heat capacities 1 / C, shape (m,): the relative change of a temperature per entropy."""
         return 1.0 / self.capacity
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array:
@@ -127,15 +127,15 @@ class _ReservoirEnergyOfTime(StateTimeEnergy):
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         """Return the mean temperature, and the difference quotient of the temperatures times the mean entropy."""
-        (y, start), (change, duration) = x + compensation, d
+        (y, start_time), (change, duration) = x + compensation, d
         assert isinstance(self.energy, SpanLimitedEnergy)
         assert isinstance(self.energy.energy, _TemperatureTimesEntropy)
         temperature, clip = self.energy.energy.temperature, self.energy.span.clip
-        first, last = temperature(clip(start)), temperature(clip(start + duration))
-        _, slope = jax.jvp(temperature, (clip(start),), (jnp.ones(()),))
+        start_temperature, end_temperature = temperature(clip(start_time)), temperature(clip(start_time + duration))
+        _, slope = jax.jvp(temperature, (clip(start_time),), (jnp.ones(()),))
         is_zero = duration == 0.0
-        rate = jnp.where(is_zero, slope, (last - first) / jnp.where(is_zero, 1.0, duration))
-        return jnp.stack([0.5 * (first + last), rate * (y + 0.5 * change)])
+        rate = jnp.where(is_zero, slope, (end_temperature - start_temperature) / jnp.where(is_zero, 1.0, duration))
+        return jnp.stack([0.5 * (start_temperature + end_temperature), rate * (y + 0.5 * change)])
 
 
 class ZeroEnergy(Energy):
@@ -150,39 +150,42 @@ class ZeroEnergy(Energy):
         return jnp.zeros_like(x)
 
 
-def bath_terms(energy: Energy) -> list[Energy]:
-    """Return the terms of the energy of baths, each as a function of the entropies of its own baths."""
-    return [term.term if isinstance(term, Pullback) else term for term in energy.terms]
+def bath_energy_terms(baths_energy: Energy) -> list[Energy]:
+    """Return the terms of the energy of some baths, each as a function of the entropies of its own baths only."""
+    return [term.term if isinstance(term, Pullback) else term for term in baths_energy.terms]
 
 
-def keeps_temperatures(energy: Energy) -> bool:
-    """Return whether no temperature of some baths with this energy depends on their entropies."""
-    return all(isinstance(term, ReservoirEnergy | DrivenReservoirEnergy) for term in bath_terms(energy))
+def has_entropy_independent_temperatures(baths_energy: Energy) -> bool:
+    """Return whether the temperatures of baths with this energy do not depend on their entropies."""
+    return all(isinstance(term, ReservoirEnergy | DrivenReservoirEnergy) for term in bath_energy_terms(baths_energy))
 
 
 def make_bath_energy(capacity: jax.Array, temperature: jax.Array) -> BathEnergy | ReservoirEnergy:
-    """Return the energy of baths of constant capacities, finite or infinite, shape (m,) each."""
+    """Return the energy of baths with these heat capacities and temperatures, shape (m,) each.
+
+    The capacities are all finite or all infinite.
+    """
     if is_traced(capacity) or not np.isinf(np.asarray(capacity)).all():
         return BathEnergy(capacity, temperature)
     return ReservoirEnergy(temperature)
 
 
-def _exponential_and_quotient(z) -> tuple[jax.Array, jax.Array]:
-    """Return ``exp(z)`` and ``(exp(z) - 1) / z``, elementwise; by their series if all z are small, as within a step."""
+def _exp_and_expm1_quotient(z) -> tuple[jax.Array, jax.Array]:
+    """Return ``exp(z)`` and ``(exp(z) - 1) / z`` elementwise, by their series if all z are small, as within a step."""
 
-    def both_by_series() -> tuple[jax.Array, jax.Array]:
-        """Sum the series by pairs of terms, which the processor can compute in parallel."""
+    def sum_both_series() -> tuple[jax.Array, jax.Array]:
+        """Return both values from their series, summed by pairs of terms, which a processor computes in parallel."""
         terms, power = [jnp.full_like(z, 1.0 / math.factorial(n)) for n in range(1, 9)], z
         while len(terms) > 1:
             terms = [a + power * b for a, b in zip(terms[::2], terms[1::2], strict=True)]
             power = power * power
         return 1.0 + z * terms[0], terms[0]
 
-    def both_by_expm1() -> tuple[jax.Array, jax.Array]:
+    def compute_both_by_expm1() -> tuple[jax.Array, jax.Array]:
         is_zero = z == 0.0
         return jnp.exp(z), jnp.where(is_zero, 1.0, jnp.expm1(z) / jnp.where(is_zero, 1.0, z))
 
-    return jax.lax.cond(jnp.max(jnp.abs(z)) <= MAX_SERIES_ARGUMENT, both_by_series, both_by_expm1)
+    return jax.lax.cond(jnp.max(jnp.abs(z)) <= MAX_SERIES_ARGUMENT, sum_both_series, compute_both_by_expm1)
 
 
 class BodyBathsEnergy(Energy):
@@ -225,6 +228,7 @@ class BodyBathsEnergy(Energy):
 
     @property
     def _energies_and_components(self) -> tuple[tuple[Energy, Components], ...]:
+        """Energy and components of the state of the body, then of the baths."""
         return (self.body, Components(range(self.body_dim))), (self.baths, Components(range(self.body_dim, self.dim)))
 
     def value(self, x) -> jax.Array:
@@ -287,7 +291,7 @@ def temperature_derivatives_by_entropy(energy: Energy, x, body_dim: int) -> jax.
     """
     if not isinstance(energy, BodyBathsEnergy):
         return jax.jvp(energy.gradient, (x,), (jnp.zeros_like(x).at[body_dim:].set(1.0),))[1][body_dim:]
-    if keeps_temperatures(energy.baths):
+    if has_entropy_independent_temperatures(energy.baths):
         return None
     y = x[body_dim:]
     return jax.jvp(energy.baths.gradient, (y,), (jnp.ones_like(y),))[1]

@@ -17,7 +17,7 @@ from .energy import Energy, Function, Multiple, Negative, Pullback, SpanLimitedE
 
 
 def with_polynomial_degrees(energy: Energy, dim: int) -> Energy:
-    """Return an energy in which each plain function that is written as a polynomial has its degree set."""
+    """Return the energy with the degree set in each of its plain functions that is written as a polynomial."""
     if isinstance(energy, Sum):
         return Sum(tuple(with_polynomial_degrees(term, dim) for term in energy.summands))
     if isinstance(energy, Negative):
@@ -72,8 +72,10 @@ def checked_energy(energy: Energy, dim: int, role: str, allow_time: bool = False
             term.check_components(dim, role)  # names the term if its coordinates are at fault
         if isinstance(error, IndexOutOfRangeError):
             raise error.with_function(f"{role}, a function of a state of shape ({dim},),") from None
-        cure = "It must be written with jax.numpy and accept one array"
-        message = trace_error_message(f"{role} could not be evaluated on a state of shape ({dim},)", error, cure)
+        default_advice = "It must be written with jax.numpy and accept one array"
+        message = trace_error_message(
+            f"{role} could not be evaluated on a state of shape ({dim},)", error, default_advice
+        )
         raise FunctionError(message) from error
     for term in energy.terms:
         term.check_components(dim, role)
@@ -87,14 +89,14 @@ def checked_energy(energy: Energy, dim: int, role: str, allow_time: bool = False
 
 
 def trace_energies(tree, dim: int, role: str | None = None):
-    """Return a pytree with each energy checked and traced; an energy that occurs twice is traced once and stays one
-    object.
+    """Return a pytree with each energy in it checked and traced.
 
+    An energy that occurs twice is traced once and stays one object.
     Without a role, an energy that fails the check is left unchanged.
     """
     checked_energies: dict[int, Energy] = {}
 
-    def checked_node(node):
+    def check_node(node):
         if not isinstance(node, Energy):
             return node
         if id(node) not in checked_energies:
@@ -106,17 +108,19 @@ def trace_energies(tree, dim: int, role: str | None = None):
                 checked_energies[id(node)] = node
         return checked_energies[id(node)]
 
-    return jax.tree_util.tree_map(checked_node, tree, is_leaf=lambda node: isinstance(node, Energy))
+    return jax.tree_util.tree_map(check_node, tree, is_leaf=lambda node: isinstance(node, Energy))
 
 
 def traced_function_and_shape(
     function: Callable,
     argument_shapes: Sequence[tuple[int, ...]],
     allowed_shapes: Sequence[tuple[int, ...]],
-    what: str,
-    at: str,
+    function_description: str,
+    arguments_description: str,
 ) -> tuple[Callable, tuple[int, ...]]:
-    """Return a traced function of arrays of given shapes, and the shape of its result; ``at`` names its arguments.
+    """Return a traced function of arrays of given shapes, and the shape of its result.
+
+    Messages name the function by ``function_description``, and its arguments by ``arguments_description``.
 
     Raises
     ------
@@ -128,12 +132,16 @@ def traced_function_and_shape(
             function, lambda function, *a: jnp.asarray(function(*a)), *argument_shapes
         )
     except IndexOutOfRangeError as error:
-        raise error.with_function(f"{what}, at {at},") from None
+        raise error.with_function(f"{function_description}, at {arguments_description},") from None
     except TRACE_ERRORS as error:
-        raise FunctionError(trace_error_message(f"{what} could not be evaluated at {at}", error)) from error
+        raise FunctionError(
+            trace_error_message(f"{function_description} could not be evaluated at {arguments_description}", error)
+        ) from error
     if result.shape not in allowed_shapes:
         expected_shapes = " or ".join(map(str, allowed_shapes))
-        raise FunctionError(f"{what} must have shape {expected_shapes}, got {result.shape}")
+        raise FunctionError(f"{function_description} must have shape {expected_shapes}, got {result.shape}")
     if jnp.iscomplexobj(result):
-        raise FunctionError(f"{what} must be real, got {result.dtype}. Take the real part if that is meant")
+        raise FunctionError(
+            f"{function_description} must be real, got {result.dtype}. Take the real part if that is meant"
+        )
     return function, result.shape

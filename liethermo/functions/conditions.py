@@ -17,7 +17,7 @@ from ..errors import InputError
 
 
 class TracedCondition(NamedTuple):
-    """A condition on a value that is being traced.
+    """A condition on a value that is being traced, recorded for a check with numbers.
 
     Attributes
     ----------
@@ -48,14 +48,14 @@ def collect_conditions() -> Iterator[list[TracedCondition]]:
         _collected_conditions.reset(token)
 
 
-def require_condition(value, test: Callable, template: str) -> None:
+def require_condition(value, test: Callable, message_template: str) -> None:
     """Raise InputError unless a test is true for all entries of a value; record the test of a traced value.
 
     Parameters
     ----------
     value : array
     test : function from an array to an array of truth values
-    template : str
+    message_template : str
         The message, with a placeholder ``{value}`` for the value as a list.
 
     Raises
@@ -64,12 +64,12 @@ def require_condition(value, test: Callable, template: str) -> None:
     """
     if is_traced(value):
         if (conditions := _collected_conditions.get()) is not None:
-            conditions.append(TracedCondition(jnp.all(test(value)), value, template))
+            conditions.append(TracedCondition(jnp.all(test(value)), value, message_template))
     elif not bool(np.all(test(np.asarray(value)))):
-        raise InputError(refusal_message(template, value))
+        raise InputError(condition_message(message_template, value))
 
 
-def checked_numbers(value, what: str, *shapes: tuple[int, ...]) -> jax.Array:
+def checked_numbers(value, quantity_name: str, *shapes: tuple[int, ...]) -> jax.Array:
     """Return a user's numbers as an array of float64; check its shape if shapes are given.
 
     Raises
@@ -84,14 +84,14 @@ def checked_numbers(value, what: str, *shapes: tuple[int, ...]) -> jax.Array:
         array = real_array(value)
     except (TypeError, ValueError) as error:
         description = repr(value) if isinstance(value, str | complex | None) else type(value).__name__
-        raise InputError(f"{what} must be made of real numbers, got {description}") from error
+        raise InputError(f"{quantity_name} must be made of real numbers, got {description}") from error
     if shapes == ((),) and array.shape:
-        raise InputError(f"{what} must be one number, got an array of shape {array.shape}")
+        raise InputError(f"{quantity_name} must be one number, got an array of shape {array.shape}")
     if shapes and array.shape not in shapes:
-        raise InputError(f"{what} must have shape {' or '.join(map(str, shapes))}, got {array.shape}")
+        raise InputError(f"{quantity_name} must have shape {' or '.join(map(str, shapes))}, got {array.shape}")
     return array
 
 
-def refusal_message(template: str, value) -> str:
-    """Return the message of a condition with the value inserted."""
-    return template.format(value=np.asarray(value).tolist())
+def condition_message(message_template: str, value) -> str:
+    """Return the error message of a condition, from its template with a placeholder for the value."""
+    return message_template.format(value=np.asarray(value).tolist())

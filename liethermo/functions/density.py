@@ -16,6 +16,7 @@ import manifolds as mf
 from manifolds._pytree_module import Module
 
 from ..errors import InputError
+from ..tracing.short_form import callable_name
 from .energy import Energy, Linear
 
 NEGATIVE_EIGENVALUE_LIMIT = 1e-12
@@ -26,6 +27,10 @@ SMALLEST_EIGENVALUE = 1e-40
 
 REST_RTOL = 4.0 * float(np.finfo(np.float64).eps)
 """Length of a step, relative to the state, below which it is rounding: its gradients are not corrected along it."""
+
+
+DEFECT_RTOL = 4.0 * float(np.finfo(np.float64).eps)
+"""Defect of the entropy in a step, relative to the length of its gradient and of the state, that is not corrected."""
 
 
 class VonNeumann(Energy):
@@ -84,6 +89,10 @@ class VonNeumann(Energy):
         change = jnp.dot(self.discrete_gradient(scheme, path.start, path.step, path.compensation), path.step)
         defect, squared_norm = change - h * (b @ jnp.sum(gradients * k, axis=1)), h * (b @ jnp.sum(k * k, axis=1))
         is_at_rest = h * squared_norm <= (REST_RTOL**2) * jnp.sum(path.start * path.start)
+        # Rounding of an eigenvalue near zero changes its logarithm by up to 50, and its rate by rounding. The defect
+        # then consists of rounding that does not vanish with the step, so the correction would exceed the slope.
+        rounding = DEFECT_RTOL * jnp.max(jnp.linalg.norm(gradients, axis=1)) * jnp.linalg.norm(path.start)
+        defect = defect - jnp.clip(defect, -rounding, rounding)
         return gradients + jnp.where(is_at_rest, 0.0, defect / jnp.where(is_at_rest, 1.0, squared_norm)) * k
 
 
@@ -210,21 +219,24 @@ def matrix_logarithm(rho) -> jax.Array:
 
 
 class DensityMatrixFunction(Module):
-    """A function of a density matrix, as a function of the state: coordinates of the matrix, then those of baths."""
+    """A function of the state of a quantum system that evaluates a function of its density matrix.
+
+    The state has the coordinates of the matrix first, then those of baths.
+    """
 
     function: Callable
     structure: mf.DensityMatrices
 
     @property
     def __name__(self) -> str:
-        return getattr(self.function, "__name__", "preserved")
+        return callable_name(self.function, "preserved")
 
     def __call__(self, x):
         return self.function(self.structure.matrix(x[: self.structure.dim]))
 
 
 class MeanEnergy(Linear):
-    """The mean energy ``tr(rho H)``, by the coordinates of rho, shape (N^2,), which has trace one, and those of H.
+    """The mean energy ``tr(rho H)`` as a function of the coordinates of rho, shape (N^2,), which has trace one.
 
     An energy e that the levels have in common is added as a constant: ``tr(rho (H - e)) + e``. The gradient then
     depends on differences of levels only, so a constant added to H changes neither the motion nor its rounding.
@@ -234,7 +246,7 @@ class MeanEnergy(Linear):
     b : array, shape (N^2,)
         The coordinates of H.
     reference_level : array, shape ()
-        The energy e: see :func:`choose_reference_level`. It affects rounding only.
+        The energy e: see :func:`lower_level_of_smallest_gap`. It affects rounding only.
     """
 
     reference_level: jax.Array
@@ -249,11 +261,10 @@ class MeanEnergy(Linear):
         return MeanEnergy(-self.b, -self.reference_level)
 
 
-def choose_reference_level(levels: np.ndarray) -> float:
-    """Return the lower level of the pair with the smallest gap; as the zero of energy it keeps all digits of the
-    gap.
+def lower_level_of_smallest_gap(levels: np.ndarray) -> float:
+    """Return the lower one of the two levels, among levels of shape (N,), that are separated by the smallest gap.
 
-    It grows by c if all levels, shape (N,), do.
+    With this level as the zero of energy, the gap keeps all its digits. The result grows by c if all levels do.
     """
     sorted_levels = np.sort(levels)
     return float(sorted_levels[0 if len(sorted_levels) == 1 else np.argmin(np.diff(sorted_levels))])
@@ -267,7 +278,7 @@ def subtract_level(hamiltonian_coordinates, level) -> jax.Array:
 
 
 class ExpectationValue(Module):
-    """The mean energy ``tr(rho H(t))``, by the coordinates of rho, for a Hamiltonian that is a function of time.
+    """The mean energy ``tr(rho H(t))`` as a function of the coordinates of rho and the time.
 
     The ``reference_level``, as in :class:`MeanEnergy`, is the lowest level at time zero, so it grows by c if H does: a
     discrete gradient weights the state and the time by the two gradients of the energy.
@@ -283,7 +294,7 @@ class ExpectationValue(Module):
 
 
 class ModulatedExpectationValue(Module):
-    """The mean energy ``tr(rho (H_0 + f_1(t) H_1 + ...))``, by the coordinates of rho and of the matrices H_i.
+    """The mean energy ``tr(rho (H_0 + f_1(t) H_1 + ...))`` as a function of the coordinates of rho and the time.
 
     The ``reference_level`` is chosen as in :class:`ExpectationValue`.
     """

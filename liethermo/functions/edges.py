@@ -31,17 +31,19 @@ class Edges(NamedTuple):
     weight: jax.Array
 
 
-def graph_edges(graph, n_nodes: int, what: str, names: Sequence[str], allow_negative: bool = False) -> Edges:
-    """Return the edges of a symmetric graph, without those of weight zero.
+def graph_edges(
+    graph, n_nodes: int, weight_name: str, node_names: Sequence[str], allow_negative: bool = False
+) -> Edges:
+    """Return the checked edges of a symmetric weighted graph, without edges of weight zero.
 
     Parameters
     ----------
     graph : array, shape (nodes, nodes), or SciPy sparse matrix; or sequence of (i, j, weight), each pair once; or a
         number for the one edge of two nodes
     n_nodes : int
-    what : str
+    weight_name : str
         Name of the weights, for messages.
-    names : sequence of str
+    node_names : sequence of str
         Names of the nodes, for messages.
     allow_negative : bool
         Whether weights may be negative.
@@ -51,52 +53,58 @@ def graph_edges(graph, n_nodes: int, what: str, names: Sequence[str], allow_nega
     InputError
     """
     if isinstance(graph, jax.core.Tracer):  # a matrix that is swept or differentiated keeps all its edges
-        first, second = np.triu_indices(n_nodes, 1)
-        return Edges(first, second, graph if graph.ndim == 0 else graph[first, second])
-    first, second, weight = _edge_arrays(graph, n_nodes, what)
+        first_nodes, second_nodes = np.triu_indices(n_nodes, 1)
+        return Edges(first_nodes, second_nodes, graph if graph.ndim == 0 else graph[first_nodes, second_nodes])
+    first_nodes, second_nodes, weight = _node_and_weight_arrays(graph, n_nodes, weight_name)
     if isinstance(weight, jax.Array):  # some weights are tracers
-        return Edges(first, second, weight)
-    for e in np.flatnonzero((first == second) & (weight != 0.0))[:1]:
+        return Edges(first_nodes, second_nodes, weight)
+    for e in np.flatnonzero((first_nodes == second_nodes) & (weight != 0.0))[:1]:
         raise InputError(
-            f"{what} of {names[first[e]]} with itself must be 0, got {weight[e]:g}. Leave the diagonal zero"
+            f"{weight_name} of {node_names[first_nodes[e]]} with itself must be 0, got {weight[e]:g}. "
+            "Leave the diagonal zero"
         )
     for e in np.flatnonzero(~((allow_negative | (weight >= 0.0)) & np.isfinite(weight)))[:1]:
-        ends = f"{names[first[e]]} and {names[second[e]]}"
+        ends = f"{node_names[first_nodes[e]]} and {node_names[second_nodes[e]]}"
         raise InputError(
-            f"{what} between {ends} must be finite{'' if allow_negative else ' and >= 0'}, got {weight[e]:g}"
+            f"{weight_name} between {ends} must be finite{'' if allow_negative else ' and >= 0'}, got {weight[e]:g}"
         )
     is_nonzero = weight != 0.0
-    return Edges(first[is_nonzero], second[is_nonzero], jnp.asarray(weight[is_nonzero]))
+    return Edges(first_nodes[is_nonzero], second_nodes[is_nonzero], jnp.asarray(weight[is_nonzero]))
 
 
 def connected_component_labels(graph: Edges, n_nodes: int) -> np.ndarray:
-    """Return the number of the connected component of each node, shape (nodes,)."""
+    """Return the label of the connected component to which each node belongs, shape (nodes,)."""
     matrix = scipy.sparse.coo_array((np.ones(len(graph.first)), (graph.first, graph.second)), (n_nodes, n_nodes))
     return scipy.sparse.csgraph.connected_components(matrix, directed=False)[1]
 
 
-def _edge_arrays(graph, nodes: int, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | jax.Array]:
+def _node_and_weight_arrays(
+    graph, n_nodes: int, weight_name: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | jax.Array]:
+    """Return the first nodes, second nodes and weights of the edges of a graph in any of the accepted forms."""
     if scipy.sparse.issparse(graph) or _is_matrix(graph):
-        return _matrix_edges(scipy.sparse.coo_array(graph), nodes, what)
+        return _edges_of_matrix(scipy.sparse.coo_array(graph), n_nodes, weight_name)
     if not _is_edge_list(graph) and np.ndim(graph) == 0:
-        if nodes != 2:
-            raise InputError(f"{what} may be one number only for two parts, got {nodes} parts. Give a matrix or edges")
+        if n_nodes != 2:
+            raise InputError(
+                f"{weight_name} may be one number only for two parts, got {n_nodes} parts. Give a matrix or edges"
+            )
         graph = [(0, 1, graph)]
     weight_by_pair: dict[tuple[int, int], Any] = {}
     for edge in graph:
         try:
-            first, second, k = edge
-            i, j, k = int(first), int(second), k if isinstance(k, jax.core.Tracer) else float(k)
-            if (i, j) != (first, second):
+            first_node, second_node, k = edge
+            i, j, k = int(first_node), int(second_node), k if isinstance(k, jax.core.Tracer) else float(k)
+            if (i, j) != (first_node, second_node):
                 raise TypeError("not whole numbers")
         except (TypeError, ValueError):
-            raise InputError(f"{what}: an edge must be (i, j, weight), got {edge!r}") from None
-        if not (0 <= i < nodes and 0 <= j < nodes):
+            raise InputError(f"{weight_name}: an edge must be (i, j, weight), got {edge!r}") from None
+        if not (0 <= i < n_nodes and 0 <= j < n_nodes):
             raise InputError(
-                f"{what}: the edge ({i}, {j}) must join two of the {nodes} parts, which are numbered from 0"
+                f"{weight_name}: the edge ({i}, {j}) must join two of the {n_nodes} parts, which are numbered from 0"
             )
         if (min(i, j), max(i, j)) in weight_by_pair:
-            raise InputError(f"{what}: the edge between {i} and {j} is given twice")
+            raise InputError(f"{weight_name}: the edge between {i} and {j} is given twice")
         weight_by_pair[min(i, j), max(i, j)] = k
     ends = np.array(list(weight_by_pair), dtype=int).reshape(-1, 2)
     weights = list(weight_by_pair.values())
@@ -104,17 +112,21 @@ def _edge_arrays(graph, nodes: int, what: str) -> tuple[np.ndarray, np.ndarray, 
     return ends[:, 0], ends[:, 1], jnp.stack([jnp.asarray(k) for k in weights]) if has_tracers else np.array(weights)
 
 
-def _matrix_edges(matrix, nodes: int, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    if matrix.shape != (nodes, nodes):
-        raise InputError(f"{what} of {nodes} parts must be a ({nodes}, {nodes}) matrix, got shape {matrix.shape}")
+def _edges_of_matrix(matrix, n_nodes: int, weight_name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the first nodes, second nodes and weights of the upper triangle of a symmetric sparse matrix."""
+    if matrix.shape != (n_nodes, n_nodes):
+        raise InputError(
+            f"{weight_name} of {n_nodes} parts must be a ({n_nodes}, {n_nodes}) matrix, got shape {matrix.shape}"
+        )
     asymmetry = abs(matrix - matrix.T).max()
     if not asymmetry <= ASYMMETRY_RTOL * abs(matrix).max():
-        raise InputError(f"{what} must be symmetric, but it differs from its transpose by {asymmetry:.3g}")
+        raise InputError(f"{weight_name} must be symmetric, but it differs from its transpose by {asymmetry:.3g}")
     upper = scipy.sparse.triu(matrix).tocoo()
     return upper.row.astype(int), upper.col.astype(int), upper.data.astype(float)
 
 
 def _is_matrix(graph) -> bool:
+    """Return whether a graph is given as a square matrix of numbers."""
     try:
         array = np.asarray(graph, dtype=float)
     except (TypeError, ValueError):
@@ -123,4 +135,5 @@ def _is_matrix(graph) -> bool:
 
 
 def _is_edge_list(graph) -> bool:
+    """Return whether a graph is given as a sequence of tuples, its edges."""
     return isinstance(graph, list | tuple) and all(isinstance(edge, tuple) for edge in graph)

@@ -23,10 +23,17 @@ from manifolds._precision import with_library_settings
 from manifolds._pytree_module import Module, forward_to
 
 from ..errors import FunctionError, InputError
-from ..tracing.programs import subprogram
-from ..tracing.short_form import short_form
+from ..tracing.programs import jit_subprogram
+from ..tracing.short_form import callable_name, short_form
 from .conditions import checked_numbers
-from .indices import ComponentMap, Components, check_coordinates, clique_pattern, sparsity_pattern, union_pattern
+from .indices import (
+    ComponentMap,
+    Components,
+    check_coordinates_are_quadratic,
+    clique_pattern,
+    sparsity_pattern,
+    union_pattern,
+)
 from .path import CollocationPath, DiscreteGradientScheme
 from .rounding import value_and_rounding_scale
 from .time_span import (
@@ -43,8 +50,9 @@ from .time_span import (
 )
 
 
-@subprogram
-def _gradient(energy: Energy, x) -> jax.Array:
+@jit_subprogram
+def _autodiff_gradient(energy: Energy, x) -> jax.Array:
+    """Return the gradient of an energy at a state, computed by JAX."""
     return jax.grad(energy.value)(x)
 
 
@@ -52,7 +60,7 @@ MIN_BUFFERED_DIM = 1_000
 """Number of components from which a gradient is stored in memory before it is used."""
 
 
-def _evaluate_buffered(function: Callable, x) -> jax.Array:
+def _evaluate_into_buffer(function: Callable, x) -> jax.Array:
     """Return ``function(x)``, of the shape of x, computed once and stored; NaN if the first entry of x is not finite.
 
     XLA would compute elementwise results anew for each use of an entry, but it stores the result of a branch.
@@ -80,7 +88,11 @@ class Energy(Module):
     def gradient(self, x) -> jax.Array:
         """Return the gradient at one state, shape (n,)."""
         x = float64_array(x)
-        return _gradient(self, x) if x.size < MIN_BUFFERED_DIM else _evaluate_buffered(lambda x: _gradient(self, x), x)
+        return (
+            _autodiff_gradient(self, x)
+            if x.size < MIN_BUFFERED_DIM
+            else _evaluate_into_buffer(lambda x: _autodiff_gradient(self, x), x)
+        )
 
     def sensitivity(self, x) -> jax.Array:
         """Return the scale ``|grad f(x)| |x|`` of the errors that rounding of x causes; for a sum, added over terms.
@@ -133,7 +145,7 @@ class Energy(Module):
         return scheme(self, path)
 
     def pullback_to_chart(self, coordinates: mf.Coordinates, space: mf.Space, start=None) -> Energy:
-        """Return a function of state vectors of a space as a function of coordinates.
+        """Return this energy of state vectors of a space as an energy of the coordinates of a chart.
 
         For a single step, ``start`` is the state vector at which the step begins.
         """
@@ -165,7 +177,7 @@ class Energy(Module):
 
     def map_terms(self, transform: Callable[[Energy], Energy]) -> Energy:
         """Return the sum of ``transform(term)``, an energy, over the terms."""
-        return Sum.of([transform(term) for term in self.terms])
+        return Sum.from_terms([transform(term) for term in self.terms])
 
     @property
     def depends_on_time(self) -> bool:
@@ -177,16 +189,20 @@ class Energy(Module):
         return self
 
     def with_time(self) -> Energy:
-        """Return a time-dependent energy as one of the state with the time appended, shape (n + 1,)."""
+        """Return a time-dependent energy as an energy of the state with the time appended, shape (n + 1,)."""
         raise NotImplementedError(f"{type(self).__name__} does not depend on time")
 
     @with_library_settings
     def __call__(self, x, t=None) -> jax.Array:
-        x = jnp.asarray(x, dtype=jnp.float64)
+        x = self.flattened_states(jnp.asarray(x, dtype=jnp.float64))
         if t is None:
             return jnp.vectorize(self.value, signature="(n)->()")(x)
         evaluate = jnp.vectorize(lambda x, t: self.at_time(t).value(x), signature="(n),()->()")
         return evaluate(x, jnp.asarray(t, dtype=jnp.float64))
+
+    def flattened_states(self, x) -> jax.Array:
+        """Return states, shape (..., n), from states in that shape or in another one that the energy accepts."""
+        return x
 
     def __add__(self, other) -> Energy:
         return Sum((*self.terms, *make_energy(other, "a term of a sum").terms))
@@ -269,17 +285,17 @@ class Quadratic(Energy):
 
     is_quadratic = True
 
-    def linear_part(self, x) -> jax.Array:
-        """Return ``A x``."""
+    def apply_matrix(self, x) -> jax.Array:
+        """Return the matrix of the quadratic form times x, shape (n,)."""
         return self.A * x if self.A.ndim == 1 else self.A @ x
 
     def value(self, x) -> jax.Array:
         linear = 0.0 if self.b is None else jnp.dot(self.b, x)
-        return 0.5 * jnp.dot(x, self.linear_part(x)) + linear + self.c
+        return 0.5 * jnp.dot(x, self.apply_matrix(x)) + linear + self.c
 
     def gradient(self, x) -> jax.Array:
-        linear_part = self.linear_part(float64_array(x))
-        return linear_part if self.b is None else linear_part + self.b
+        matrix_vector_product = self.apply_matrix(float64_array(x))
+        return matrix_vector_product if self.b is None else matrix_vector_product + self.b
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
         if is_traced(self.A):
@@ -398,7 +414,7 @@ class TimeDependent(Energy, FunctionWithBreaks):
 
 
 class SpanLimitedEnergy(Energy):
-    """A function of a state with the time appended, shape (n + 1,), whose time is clipped to a span."""
+    """An energy of a state with the time appended, shape (n + 1,), whose time is clipped to a span."""
 
     energy: Energy
     span: TimeSpan
@@ -440,19 +456,19 @@ class StateTimeEnergy(Energy):
         compensation = jnp.zeros_like(x) + compensation
         ends = jnp.stack([x + compensation, x + (compensation + d)])
 
-        def mean(states, times):
+        def mean_of_two_values(states, times):
             values = jax.vmap(lambda y, t: self.value(jnp.append(y, t)))(states, times)
             return 0.5 * (values[0] + values[1])
 
-        def mean_over_end_times(y):
-            return mean(jnp.stack([y, y]), ends[:, -1])
+        def average_over_end_times(y):
+            return mean_of_two_values(jnp.stack([y, y]), ends[:, -1])
 
-        def mean_over_end_states(t):
-            return mean(ends[:, :-1], jnp.concatenate([t, t]))
+        def average_over_end_states(t):
+            return mean_of_two_values(ends[:, :-1], jnp.concatenate([t, t]))
 
-        state_gradient = scheme.general(Function(mean_over_end_times), x[:-1], d[:-1], compensation[:-1])
+        state_gradient = scheme.general(Function(average_over_end_times), x[:-1], d[:-1], compensation[:-1])
         return jnp.concatenate(
-            [state_gradient, scheme.general(Function(mean_over_end_states), x[-1:], d[-1:], compensation[-1:])]
+            [state_gradient, scheme.general(Function(average_over_end_states), x[-1:], d[-1:], compensation[-1:])]
         )
 
     def stage_gradients(self, scheme, path) -> jax.Array:
@@ -460,7 +476,11 @@ class StateTimeEnergy(Energy):
 
 
 def _squared_gradient_weights(gradients) -> jax.Array:
-    """Return weights of components, shape (m,): the squared gradient by state for each, then that by time."""
+    """Return weights, shape (m,), of the components of a correction: those of the state, then that of the time.
+
+    The weight of each component of the state is the squared norm of the gradient by the state, and the weight of the
+    time is the squared derivative by the time; ``gradients``, shape (s, m), are those at the stages.
+    """
     scale = jnp.max(jnp.abs(gradients))
     squares = jnp.sum((gradients / jnp.where(scale > 0.0, scale, 1.0)) ** 2, axis=0)
     return jnp.append(jnp.full(gradients.shape[1] - 1, jnp.sum(squares[:-1])), squares[-1])
@@ -477,7 +497,10 @@ class Pullback(Energy):
     coordinates: Callable
 
     def __init__(self, term: Energy, coordinates: Sequence[int] | np.ndarray | Callable):
-        self.term, self.coordinates = term, coordinates if callable(coordinates) else Components.of(coordinates)
+        self.term, self.coordinates = (
+            term,
+            coordinates if callable(coordinates) else Components.from_indices(coordinates),
+        )
 
     @property
     def _selects_components(self) -> bool:
@@ -530,7 +553,7 @@ class Pullback(Energy):
         return clique_pattern([np.asarray(self.coordinates.indices) % dim], dim)
 
     def check_components(self, dim: int, role: str) -> None:
-        check_coordinates(self.coordinates, dim, role)
+        check_coordinates_are_quadratic(self.coordinates, dim, role)
 
     depends_on_time = forward_to("term")
 
@@ -570,6 +593,7 @@ class Negative(Energy):
 
     couplings = forward_to("term")
     check_components = forward_to("term")
+    flattened_states = forward_to("term")
 
     def __neg__(self) -> Energy:
         return self.term
@@ -598,6 +622,7 @@ class Multiple(Energy):
 
     couplings = forward_to("term")
     check_components = forward_to("term")
+    flattened_states = forward_to("term")
 
     def multiple(self, factor) -> Energy:
         return Multiple(self.term, factor * self.factor)
@@ -612,7 +637,7 @@ class Sum(Energy):
     summands: tuple[Energy, ...]
 
     @classmethod
-    def of(cls, terms: Sequence[Energy]) -> Energy:
+    def from_terms(cls, terms: Sequence[Energy]) -> Energy:
         """Return the sum of some terms; a single term is returned as it is."""
         return terms[0] if len(terms) == 1 else cls(tuple(terms))
 
@@ -634,6 +659,11 @@ class Sum(Energy):
     def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
         return union_pattern(term.couplings(dim) for term in self.summands)
 
+    def flattened_states(self, x) -> jax.Array:
+        for term in self.summands:
+            x = term.flattened_states(x)
+        return x
+
     def __neg__(self) -> Energy:
         return Sum(tuple(-term for term in self.summands))
 
@@ -649,7 +679,7 @@ class Sum(Energy):
 
 def function_name(energy: Energy) -> str:
     """Return the name of the plain function of an energy; "" if there is none."""
-    return getattr(energy.function, "__name__", "") if isinstance(energy, Function | TimeDependent) else ""
+    return callable_name(energy.function, "") if isinstance(energy, Function | TimeDependent) else ""
 
 
 def make_energy(function, role: str) -> Energy:
@@ -660,7 +690,7 @@ def make_energy(function, role: str) -> Energy:
     if isinstance(function, Energy):
         return function
     if isinstance(function, list) and function and all(isinstance(term, Energy) for term in function):
-        return Sum(tuple(part for term in function for part in term.terms))
+        return Sum(tuple(summand for term in function for summand in term.terms))
     if isinstance(function, mf.Polynomial) and function.degree <= 2:
         return quadratic_from_polynomial(function)
     if callable(function):
@@ -673,7 +703,7 @@ CHART_ROUNDINGS = 4.0
 
 
 class ChartEnergy(Energy):
-    """A function of state vectors, as a function of the coordinates of a chart."""
+    """An energy of the state vectors of a space, evaluated on the coordinates of a chart."""
 
     energy: Energy
     coordinates: mf.Coordinates

@@ -40,7 +40,7 @@ class OrthonormalFrame(NamedTuple):
         return self._residual_and_coefficients(v)[0]
 
     def project_off_transposed(self, v) -> jax.Array:
-        """Return ``P^T v``, P the projector of :meth:`project_off`: an image without its component in their span."""
+        """Return ``P^T v``, where P is the matrix of :meth:`project_off`: v without its component along the images."""
         for e, image in zip(self.unit_vectors, self.images, strict=True):
             v = v - jnp.dot(e, v) * image
         return v
@@ -68,7 +68,7 @@ def gram_schmidt(
     reference_vectors: Sequence[jax.Array] | None = None,
     metric_map: Callable | None = None,
 ) -> OrthonormalFrame:
-    """Return the frame of some vectors by Gram-Schmidt, orthonormal in the form given by ``metric_map``, v -> G v.
+    """Return the Gram-Schmidt frame of some vectors, orthonormal in the inner product of ``metric_map``, v -> G v.
 
     If ``reference_vectors`` are given, their linear dependence decides instead. The discrete gradients of C and exp(C)
     may differ by a multiple of the increment, and projecting off both would then stop the motion; the gradients show

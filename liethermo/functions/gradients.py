@@ -9,8 +9,8 @@ by ``|d|``. A relaxing system ends in the regime d -> 0, where this quotient is 
 whose rounding error is about ``eps |grad H| |d|``: it vanishes with d. Only the error of the quadrature, its *defect*
 (difference minus prediction), needs the difference itself. A gate lets the defect through where it matters and
 suppresses it where it is rounding noise; the gate is continuous, scale free, and closed near d = 0
-(:func:`_gate_opening`). Quadratic terms have closed forms without a quotient. Polynomials for which the quadrature is
-exact have no defect, so no value is computed.
+(:func:`_ramp_above_threshold`). Quadratic terms have closed forms without a quotient. Polynomials for which the
+quadrature is exact have no defect, so no value is computed.
 """
 
 from __future__ import annotations
@@ -77,6 +77,7 @@ class DiscreteGradient(Module):
         return False
 
     def __call__(self, energy: Energy, x, d, compensation=0.0) -> jax.Array:
+        """Return the discrete gradient of an energy from x + compensation to x + compensation + d, shape (n,)."""
         return sum_terms(term.discrete_gradient(self, x, d, compensation) for term in energy.terms)
 
     def quadratic(self, term: Energy, x, d, compensation) -> jax.Array:
@@ -180,15 +181,18 @@ class CoordinateIncrement(DiscreteGradient):
 
     @staticmethod
     def _coordinate_quotients(term: Energy, x, d) -> jax.Array:
+        """Return the difference quotient of a term in each coordinate, shape (n,), the coordinates changed in turn."""
         n = x.shape[0]
         corners = x + jnp.tril(jnp.ones((n + 1, n)), -1) * d  # corner i has the first i coordinates of x + d
         values = _values_at_points(term, corners)
 
-        def slopes_and_gradient_norm(corner, direction, step):  # of H along the edge at a corner, and |grad H|
-            gradients = jax.vmap(lambda c: term.gradient(corner + c * step * direction))(_GAUSS_NODES_3)
-            return gradients @ direction, jnp.linalg.norm(gradients[1])
+        def edge_slopes_and_gradient_norm(
+            corner, unit_vector, increment
+        ):  # of H along the edge at a corner, and |grad H|
+            gradients = jax.vmap(lambda c: term.gradient(corner + c * increment * unit_vector))(_GAUSS_NODES_3)
+            return gradients @ unit_vector, jnp.linalg.norm(gradients[1])
 
-        edge_slopes, gradient_norms = jax.vmap(slopes_and_gradient_norm)(corners[:-1], jnp.eye(n), d)
+        edge_slopes, gradient_norms = jax.vmap(edge_slopes_and_gradient_norm)(corners[:-1], jnp.eye(n), d)
         second_differences = edge_slopes[:, 0] + edge_slopes[:, 2] - 2.0 * edge_slopes[:, 1]
         mean = edge_slopes[:, 1] + (5 / 18) * second_differences
         rounding_scales = _value_rounding_scale(values[1:], values[:-1], term.rounding_scale(x))
@@ -213,13 +217,15 @@ DISCRETE_GRADIENTS: dict[str, DiscreteGradient] = {
 """The discrete gradients, by name."""
 
 
-def get_discrete_gradient(choice: str | DiscreteGradient) -> DiscreteGradient:
-    """Return the discrete gradient of a name, or the given object."""
-    if isinstance(choice, DiscreteGradient):
-        return choice
-    if choice not in DISCRETE_GRADIENTS:
-        raise InputError(f"no discrete gradient {choice!r}; the names are {', '.join(map(repr, DISCRETE_GRADIENTS))}")
-    return DISCRETE_GRADIENTS[choice]
+def discrete_gradient_by_name(name_or_object: str | DiscreteGradient) -> DiscreteGradient:
+    """Return the discrete gradient with this name; an object is returned unchanged."""
+    if isinstance(name_or_object, DiscreteGradient):
+        return name_or_object
+    if name_or_object not in DISCRETE_GRADIENTS:
+        raise InputError(
+            f"no discrete gradient {name_or_object!r}; the names are {', '.join(map(repr, DISCRETE_GRADIENTS))}"
+        )
+    return DISCRETE_GRADIENTS[name_or_object]
 
 
 MIN_GRADIENT_VARIATION = 1e-3
@@ -233,7 +239,7 @@ MAX_NOISE_CORRECTION = 1e-10
 """Largest correction that consists of rounding noise, relative to the gradient."""
 
 
-def stage_gradients(
+def discrete_gradients_at_stages(
     energy: Energy, x, compensation, h, k, A, b, kronrod: KronrodRule | None = None, symmetries: jax.Array | None = None
 ) -> jax.Array:
     """Return discrete gradients at the stages of a collocation method, shape (s, n) [:doc:`/explanation/exact_laws`].
@@ -271,7 +277,7 @@ def _corrected_stage_gradients(term: Energy, path: CollocationPath, correction_w
     if term.is_quadratic:
         return jax.vmap(term.gradient)(path.points)
     x, compensation, k, h, b = path.start, path.compensation, path.slopes, path.h, path.b
-    change = FunctionChange.of(
+    change = FunctionChange.from_step(
         term,
         x,
         compensation,
@@ -294,7 +300,7 @@ def _corrected_stage_gradients(term: Energy, path: CollocationPath, correction_w
         change,
         gradients,
         k,
-        CorrectionDirection.of(k, b, weights, path.symmetries),
+        CorrectionDirection.from_slopes(k, b, weights, path.symmetries),
         h,
         b,
         quadrature_correction,
@@ -320,7 +326,7 @@ class CorrectionDirection(NamedTuple):
     length_fraction: jax.Array
 
     @classmethod
-    def of(cls, k, b, weights=None, symmetries=None) -> CorrectionDirection:
+    def from_slopes(cls, k, b, weights=None, symmetries=None) -> CorrectionDirection:
         """Return the direction ``d = W k``, W diagonal, without components along the symmetries, shape (s, r, m)."""
         scale = jnp.ones(()) if weights is None else sqrt_or_zero(weights)
         weighted_slopes = projection = scale * k
@@ -333,7 +339,7 @@ class CorrectionDirection(NamedTuple):
 
 
 class FunctionChange(NamedTuple):
-    """The change of a function over a step, computed from its values, and its gradients at some points.
+    """The change of an energy term over a step, computed from its values, and its gradients at some points.
 
     Attributes
     ----------
@@ -348,15 +354,15 @@ class FunctionChange(NamedTuple):
     gradients: jax.Array
 
     @classmethod
-    def of(cls, term: Energy, x, compensation, d, points: list[jax.Array]) -> FunctionChange:
+    def from_step(cls, term: Energy, x, compensation, d, points: list[jax.Array]) -> FunctionChange:
         """Return the change of a term from x + compensation to x + compensation + d."""
-        new, new_compensation = two_sum(x, compensation + d)
+        new_x, new_compensation = two_sum(x, compensation + d)
         # one vmap for all points, so that the gradient is compiled once
-        point_gradients = jax.vmap(term.gradient)(jnp.concatenate([*points, jnp.stack([x, new])]))
+        point_gradients = jax.vmap(term.gradient)(jnp.concatenate([*points, jnp.stack([x, new_x])]))
         gradients, end_gradients = point_gradients[:-2], point_gradients[-2:]
         # these matter only for rounding; an infinite one, as of a root at its end, is ignored
         end_gradients = jnp.where(jnp.isfinite(end_gradients), end_gradients, 0.0)
-        start_value, end_value = _values_at_points(term, jnp.stack([x, new]))
+        start_value, end_value = _values_at_points(term, jnp.stack([x, new_x]))
         # of the compensated states: otherwise a step would undo what rounding or a correction of the energy has changed
         difference = (end_value - start_value) + (
             jnp.dot(end_gradients[1], new_compensation) - jnp.dot(end_gradients[0], compensation)
@@ -390,12 +396,12 @@ def correct_gradients(
     noise_bound = jnp.maximum(
         jnp.abs(defect) * (1.0 / MAX_NOISE_CORRECTION), change.noise * (1.0 / MAX_DIFFERENCE_NOISE)
     )
-    noise_gate = 1.0 - _gate_opening(
+    noise_gate = 1.0 - _ramp_above_threshold(
         _safe_divide(noise_bound, h * direction.square) * length, gradient_norm * direction.length_fraction
     )
     gate = jnp.maximum(
-        _gate_opening(defect, change.noise),
-        noise_gate * _gate_opening(gradient_variation, MIN_GRADIENT_VARIATION * gradient_norm),
+        _ramp_above_threshold(defect, change.noise),
+        noise_gate * _ramp_above_threshold(gradient_variation, MIN_GRADIENT_VARIATION * gradient_norm),
     )
     return gradients + _safe_divide(quadrature_correction + _apply_gate(defect, gate), h * direction.square) * d
 
@@ -408,7 +414,7 @@ def two_sum(x, d) -> tuple[jax.Array, jax.Array]:
 
 
 def _values_at_points(term: Energy, points) -> jax.Array:
-    """Return H at each point, computed by the same instructions.
+    """Return the values of a term at points, all computed by the same machine instructions.
 
     The end of one step is the start of the next, and the rounding of H must cancel there. Two evaluations that are
     compiled separately may fuse multiplications and additions differently; H then drifts by 1e-11 in 3e5 steps.
@@ -423,14 +429,14 @@ def _value_difference_and_rounding_scale(term: Energy, x, d, compensation, gradi
     evaluated in between, adds the effect of the compensation. Otherwise a step would undo what rounding, or a
     correction of the energy, has changed.
     """
-    new, new_compensation = two_sum(x, compensation + d)
-    start_value, end_value = _values_at_points(term, jnp.stack([x, new]))
+    new_x, new_compensation = two_sum(x, compensation + d)
+    start_value, end_value = _values_at_points(term, jnp.stack([x, new_x]))
     difference = (end_value - start_value) + jnp.dot(gradient, new_compensation - compensation)
     return difference, _value_rounding_scale(start_value, end_value, term.rounding_scale(x))
 
 
 def _value_rounding_scale(start_values, end_values, term_scale):
-    """Return the scale at which the values at both ends are rounded, the largest of both and of the terms inside."""
+    """Return the scale at which values at both ends of a step are rounded, the largest of both and ``term_scale``."""
     return jnp.maximum(jnp.maximum(jnp.abs(start_values), jnp.abs(end_values)), term_scale)
 
 
@@ -453,7 +459,7 @@ def _gated_defect(
     curvature_margin = jnp.abs(second_difference) * (1.0 / CURVATURE_SWITCH) - slope_scale
     noise_margin = 2.0 * slope_scale - noise * (1.0 / max_noise)
     gate = jnp.maximum(
-        _gate_opening(defect, noise), _clipped_ratio(jnp.minimum(curvature_margin, noise_margin), slope_scale)
+        _ramp_above_threshold(defect, noise), _clipped_ratio(jnp.minimum(curvature_margin, noise_margin), slope_scale)
     )
     return _apply_gate(defect, gate)
 
@@ -464,7 +470,7 @@ def _apply_gate(defect, gate):
     return jnp.where(gate > 0.0, gate * defect, jnp.where(jnp.isfinite(defect), 0.0, defect))
 
 
-def _gate_opening(value, threshold):
+def _ramp_above_threshold(value, threshold):
     """Return 0 where ``|value| <= threshold``, 1 above twice the threshold, and a linear function between."""
     return _clipped_ratio(jnp.abs(value) - threshold, threshold)
 
@@ -481,6 +487,7 @@ def _safe_divide(numerator, denominator):
 
 
 def _gauss_rule(n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the nodes and weights of Gauss quadrature on [0, 1]."""
     points, weights = np.polynomial.legendre.leggauss(n_nodes)
     return (points + 1.0) / 2.0, weights / 2.0
 

@@ -71,20 +71,20 @@ class Indices(StaticArray):
 
 
 def sparsity_pattern(rows, columns, dim: int) -> scipy.sparse.csr_array:
-    """Return the pattern of a square matrix with entries at these rows and columns; its data are ones."""
+    """Return the sparsity pattern with entries at these rows and columns, as a (dim, dim) sparse matrix of ones."""
     rows, columns = np.asarray(rows).ravel(), np.asarray(columns).ravel()
     return pattern_of_matrix(scipy.sparse.coo_array((np.ones(len(rows), dtype=bool), (rows, columns)), (dim, dim)))
 
 
 def clique_pattern(members, dim: int) -> scipy.sparse.csr_array:
-    """Return the pattern in which all components of each row of ``members``, shape (m, r), depend on each other."""
+    """Return the sparsity pattern in which all indices of a row of ``members``, shape (m, r), couple to each other."""
     members = np.asarray(members)
     full = (*members.shape, members.shape[1])
     return sparsity_pattern(np.broadcast_to(members[:, :, None], full), np.broadcast_to(members[:, None, :], full), dim)
 
 
 def pattern_of_matrix(matrix) -> scipy.sparse.csr_array:
-    """Return a sparse matrix with every stored entry set to one."""
+    """Return the sparsity pattern of a sparse matrix: a sparse matrix of ones at its stored entries."""
     pattern = scipy.sparse.csr_array(matrix)
     pattern.sum_duplicates()
     pattern.data = np.ones(pattern.nnz, dtype=bool)
@@ -92,7 +92,7 @@ def pattern_of_matrix(matrix) -> scipy.sparse.csr_array:
 
 
 def union_pattern(patterns) -> scipy.sparse.csr_array | None:
-    """Return the union of some patterns; None, for unknown, if one of them is None."""
+    """Return the union of sparsity patterns; None, for an unknown pattern, if one of them is None."""
     known_patterns = list(patterns)
     if any(pattern is None for pattern in known_patterns):
         return None
@@ -116,17 +116,18 @@ class Components(ComponentMap):
     indices: range | Indices = eqx.field(static=True)
 
     @classmethod
-    def of(cls, numbers: Sequence[int] | np.ndarray) -> Components:
-        if isinstance(numbers, range) and numbers.step == 1 and numbers.start >= 0:
-            return cls(numbers)
-        return cls(Indices(np.asarray(numbers, dtype=np.int64)))
+    def from_indices(cls, indices: Sequence[int] | np.ndarray) -> Components:
+        """Return the components with these indices."""
+        if isinstance(indices, range) and indices.step == 1 and indices.start >= 0:
+            return cls(indices)
+        return cls(Indices(np.asarray(indices, dtype=np.int64)))
 
     def __call__(self, x):
         indices = self.indices
         return x[indices.start : indices.stop] if isinstance(indices, range) else x[np.asarray(indices)]
 
 
-def check_coordinates(coordinates: Callable, dim: int, role: str) -> None:
+def check_coordinates_are_quadratic(coordinates: Callable, dim: int, role: str) -> None:
     """Raise an error unless coordinates are components of the state or a map at most quadratic in the state."""
     if isinstance(coordinates, Components):
         invalid_indices = [i for i in np.asarray(coordinates.indices).tolist() if not -dim <= i < dim]
@@ -136,7 +137,9 @@ def check_coordinates(coordinates: Callable, dim: int, role: str) -> None:
         return
     try:
         start, end, step = evaluate_at_points(
-            _coordinates_at_ends_and_increment, coordinates, np.random.default_rng(0).standard_normal((1, 2 * dim))
+            _coordinate_values_and_quadratic_increment,
+            coordinates,
+            np.random.default_rng(0).standard_normal((1, 2 * dim)),
         )
     except TRACE_ERRORS as error:
         raise FunctionError(
@@ -154,7 +157,10 @@ def check_coordinates(coordinates: Callable, dim: int, role: str) -> None:
         )
 
 
-def _coordinates_at_ends_and_increment(coordinates: Callable, ends):
-    """Return the coordinates of two states, and the difference that a quadratic map would give."""
-    x, d = jnp.split(ends, 2)
+def _coordinate_values_and_quadratic_increment(coordinates: Callable, state_and_increment):
+    """Return the coordinates of x and of x + d, and the increment between them that a quadratic map would have.
+
+    The array ``state_and_increment`` is x followed by d.
+    """
+    x, d = jnp.split(state_and_increment, 2)
     return coordinates(x), coordinates(x + d), jax.jvp(coordinates, (x + 0.5 * d,), (d,))[1]

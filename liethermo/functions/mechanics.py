@@ -88,16 +88,20 @@ class Each(Energy):
         return self.degree <= 2
 
     def value(self, x) -> jax.Array:
-        return jnp.sum(jax.vmap(lambda y, *a: self._summand(a).value(y))(self._gather_components(x), *self.parameters))
+        return jnp.sum(
+            jax.vmap(lambda y, *a: self._summand_energy(a).value(y))(self._gather_components(x), *self.parameters)
+        )
 
     def gradient(self, x) -> jax.Array:
         x = float64_array(x)
-        gradients = jax.vmap(lambda y, *a: self._summand(a).gradient(y))(self._gather_components(x), *self.parameters)
+        gradients = jax.vmap(lambda y, *a: self._summand_energy(a).gradient(y))(
+            self._gather_components(x), *self.parameters
+        )
         return self._scatter_gradients(gradients, x.shape[0])
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         def summand_discrete_gradient(y, step, summand_compensation, *a):
-            return self._summand(a).discrete_gradient(scheme, y, step, summand_compensation)
+            return self._summand_energy(a).discrete_gradient(scheme, y, step, summand_compensation)
 
         y, step, offset = map(self._gather_components, (x, d, jnp.zeros_like(x) + compensation))
         return self._scatter_gradients(
@@ -106,7 +110,7 @@ class Each(Energy):
 
     def stage_gradients(self, scheme, path) -> jax.Array:
         def summand_stage_gradients(summand_path: CollocationPath, *a):
-            return self._summand(a).stage_gradients(scheme, summand_path)
+            return self._summand_energy(a).stage_gradients(scheme, summand_path)
 
         compensation = jnp.zeros_like(path.start) + path.compensation
         summand_paths = CollocationPath(
@@ -128,11 +132,11 @@ class Each(Energy):
             invalid_index = int(indices[(indices < 0) | (indices >= dim)][0])
             raise InputError(f"{role} has a term at component {invalid_index}, but the state has {dim} components")
 
-    def _summand(self, parameters) -> Energy:
-        """Return the summand with these parameters."""
+    def _summand_energy(self, summand_parameters) -> Energy:
+        """Return the energy of the summand that has these parameters."""
         if isinstance(self.phi, Energy):
             return self.phi
-        return Function(lambda y: self.phi(y, *parameters), degree=self.degree)
+        return Function(lambda y: self.phi(y, *summand_parameters), degree=self.degree)
 
     def _gather_components(self, x) -> jax.Array:
         """Return the components at each place, from shape (..., n) to (..., m, r)."""
@@ -148,11 +152,13 @@ class Each(Energy):
 
 
 def _summand_value(phi_and_parameters, y):
+    """Return the value of a summand at its components y; the first argument is the function and its parameters."""
     phi, parameters = phi_and_parameters
     return jnp.asarray(phi(y, *parameters))
 
 
 def _checked_places(places) -> Indices:
+    """Return places as indices; raise InputError unless they are integers of shape (m, r)."""
     indices = np.asarray(places)
     if indices.ndim != 2 or indices.dtype.kind not in "iu" or 0 in indices.shape:
         raise InputError(
@@ -240,11 +246,11 @@ class _PotentialOfVector(Module):
         return self.V(y[:-1], y[-1])
 
 
-def is_mechanical(energy: Energy, dim: int, space: mf.Space | None = None) -> bool:
-    """Return whether the terms of H are known to be ``p . G(q) p / 2``, with G semidefinite, or ``V(q, S)`` [SML 28].
+def is_kinetic_plus_potential(energy: Energy, dim: int, space: mf.Space | None = None) -> bool:
+    """Return whether each term of an energy is known to be ``p . G(q) p / 2``, with G semidefinite, or ``V(q, S)``.
 
-    On a space of positions, the symmetric part of ``P(q) G(q)`` must be semidefinite near the space, P the projector
-    onto its tangent space.
+    These are the energies of [SML 28]. On a space of positions, the symmetric part of ``P(q) G(q)`` must be
+    semidefinite near the space, P the projector onto its tangent space.
 
     Then ``p . (dgrad H)_p >= 0`` with p the midpoint, for the discrete gradients of every scheme that takes the
     midpoint gradient of a quadratic term. A plain function of the whole state is not known to be of any kind, unless it
@@ -272,14 +278,17 @@ def is_independent_of(term: Energy, points: np.ndarray, components: np.ndarray) 
     """Return whether a term is known not to depend on some components, by the Jacobian of its coordinates."""
     if isinstance(term, Each):
         return not np.isin(components, term.places).any()
-    return isinstance(term, Pullback) and not evaluate_at_points(_jacobian, term, points)[:, :, components].any()
+    return (
+        isinstance(term, Pullback)
+        and not evaluate_at_points(_coordinate_jacobian, term, points)[:, :, components].any()
+    )
 
 
 def _is_kinetic_with_potential(term: Energy, points: np.ndarray, projectors: np.ndarray | None) -> bool:
     """Return whether a term is a semidefinite form in p plus a function of q and S."""
     n = points.shape[1] // 2
     if isinstance(term, Kinetic):
-        return _is_semidefinite(evaluate_at_points(_metric, term, points), projectors)
+        return _is_semidefinite(evaluate_at_points(_metric_matrix_at_state, term, points), projectors)
     if not term.is_quadratic:
         return False
     slope, hessian = evaluate_at_points(_gradient_and_hessian_by_momenta, term, np.zeros_like(points[:1]))
@@ -295,34 +304,41 @@ def _is_semidefinite(G: np.ndarray, projectors: np.ndarray | None) -> bool:
 
 
 def _tangent_projector_matrix(space: mf.Space, q):
+    """Return the matrix of the projector onto the tangent space of a space at q, shape (n, n)."""
     point = space.from_vector(q)
     project = lambda w: space.to_vector(space._tangential_part(point, space.from_vector(w)))  # noqa: E731
     return jax.vmap(project, out_axes=1)(jnp.eye(space.size))
 
 
-def _metric(term: Kinetic, x):
+def _metric_matrix_at_state(term: Kinetic, x):
+    """Return the matrix ``G(q)`` of a kinetic energy at the positions q of a state, shape (n, n)."""
     G = term.at(_positions_and_momenta(x)[0])
     return jnp.diag(G) if G.ndim == 1 else G
 
 
 def _gradient_and_hessian_by_momenta(term: Energy, x):
+    """Return the rows of the gradient, shape (n,), and of the Hessian that belong to the momenta."""
     n = len(x) // 2
     return term.gradient(x)[n : 2 * n], jax.jacfwd(term.gradient)(x)[n : 2 * n]
 
 
-def _jacobian(term: Pullback, x):
+def _coordinate_jacobian(term: Pullback, x):
+    """Return the Jacobian of the coordinates of a term at a state."""
     return jax.jacfwd(term.coordinates)(x)
 
 
 def _positions_and_momenta(x):
+    """Return q and p of a state (q, p) or (q, p, S)."""
     n = len(x) // 2
     return x[:n], x[n : 2 * n]
 
 
 def _apply_metric(G, p):
+    """Return ``G p`` for a matrix G, or for the diagonal of a diagonal matrix."""
     return G * p if G.ndim == 1 else G @ p
 
 
 def _drop_momenta(x):
+    """Return (q, S) of a state (q, p, S)."""
     n = len(x) // 2
     return jnp.concatenate([x[:n], x[2 * n :]])

@@ -26,7 +26,10 @@ def jacobian_and_value(function: Callable, *arguments):
 
 
 def newton_correction(jacobian, residual) -> jax.Array:
-    """Return the step that Newton's method subtracts: numbers, or shapes (n, n) and (n,)."""
+    """Return ``jacobian^-1 residual``, the step that Newton's method subtracts.
+
+    The arguments are numbers, or a matrix and a vector, shapes (n, n) and (n,).
+    """
     return residual / jacobian if jnp.ndim(residual) == 0 else solve(jacobian, residual[:, None])[:, 0]
 
 
@@ -40,9 +43,9 @@ def newton_iterate(function: Callable, start, n_steps: int, jacobian_and_value: 
     return jax.lax.fori_loop(0, n_steps, lambda _, y: y - newton_correction(*jacobian_and_value(function, y)), start)
 
 
-def nan_unless_small(y, residual, bound) -> jax.Array:
+def nan_unless_small(y, residual, max_residual) -> jax.Array:
     """Return y, or NaN if an entry of the residual exceeds the bound."""
-    return jnp.where(jnp.max(jnp.abs(residual)) <= bound, y, jnp.nan)
+    return jnp.where(jnp.max(jnp.abs(residual)) <= max_residual, y, jnp.nan)
 
 
 @eqx.filter_custom_jvp
@@ -52,33 +55,39 @@ def inverse_gradient(lagrangian: Energy, mu: jax.Array) -> jax.Array:
     def residual(xi):
         return lagrangian.gradient(xi) - mu
 
-    def refine(carry):
+    def take_damped_newton_step(carry):
         xi, r, _, k = carry
         step = newton_correction(jax.hessian(lagrangian.value)(xi), r)
 
-        def shorten(state):
+        def halve_step(state):
             t, _ = state
             return 0.5 * t, residual(xi - 0.5 * t * step)
 
         def is_too_long(state):
-            t, trial = state
-            return (t > 1e-4) & ~(jnp.linalg.norm(trial) <= (1.0 - 0.25 * t) * jnp.linalg.norm(r) + 1e-300)
+            t, trial_residual = state
+            return (t > 1e-4) & ~(jnp.linalg.norm(trial_residual) <= (1.0 - 0.25 * t) * jnp.linalg.norm(r) + 1e-300)
 
-        t, trial = jax.lax.while_loop(is_too_long, shorten, (1.0, residual(xi - step)))
-        shrinking = jnp.linalg.norm(trial) < jnp.linalg.norm(r)
-        return jnp.where(shrinking, xi - t * step, xi), jnp.where(shrinking, trial, r), shrinking, k + 1
+        t, trial_residual = jax.lax.while_loop(is_too_long, halve_step, (1.0, residual(xi - step)))
+        is_decreasing = jnp.linalg.norm(trial_residual) < jnp.linalg.norm(r)
+        return (
+            jnp.where(is_decreasing, xi - t * step, xi),
+            jnp.where(is_decreasing, trial_residual, r),
+            is_decreasing,
+            k + 1,
+        )
 
     def should_continue(carry):
-        _, _, shrinking, k = carry
-        return shrinking & (k < MAX_NEWTON_ITERATIONS)
+        _, _, is_decreasing, k = carry
+        return is_decreasing & (k < MAX_NEWTON_ITERATIONS)
 
     start = jnp.zeros_like(mu)
-    xi, r, _, _ = jax.lax.while_loop(should_continue, refine, (start, residual(start), True, 0))
+    xi, r, _, _ = jax.lax.while_loop(should_continue, take_damped_newton_step, (start, residual(start), True, 0))
     return jnp.where(jnp.linalg.norm(r) <= 1e-10 * (1.0 + jnp.linalg.norm(mu)), xi, jnp.nan)
 
 
 @inverse_gradient.def_jvp
 def _inverse_gradient_jvp(primals, tangents):
+    """Return the inverse gradient and its tangent, from the derivative of ``grad l(xi) = mu``."""
     lagrangian, mu = primals
     lagrangian_dot, mu_dot = tangents
     xi = inverse_gradient(lagrangian, mu)

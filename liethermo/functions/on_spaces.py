@@ -24,14 +24,15 @@ from manifolds.structures.spins import (
     sum_of_dots,
 )
 
+from ..tracing.short_form import callable_name
 from .bath_energy import BodyBathsEnergy
 from .energy import Energy, Function, Multiple, Negative, Pullback, Quadratic, Sum, TimeDependent
 from .indices import ComponentMap
 from .magnetism.spin_energy import SpinEnergy, flatten_covectors, lattice_spins
 
 
-class PointEnergy(Energy):
-    """A function of the points of a space, as a function of their vectors, shape (n,)."""
+class PointEnergyOnVectors(Energy):
+    """An energy of points of a space, evaluated on the vectors that hold the points, shape (n,)."""
 
     energy: Energy
     space: mf.Space = eqx.field(static=True)
@@ -41,20 +42,24 @@ class PointEnergy(Energy):
 
 
 def energy_of_vectors(energy: Energy, space: mf.Space | None) -> Energy:
-    """Return an energy of the points of a space as one of their vectors; an lt.Quadratic is returned unchanged."""
+    """Return an energy of points of a space as an energy of the vectors that hold the points.
+
+    An lt.Quadratic is a function of vectors already, and is returned unchanged.
+    """
     if space is None or space.shape == (space.size,):
         return energy
     return energy.map_terms(lambda term: _term_on_state_vectors(term, space))
 
 
 def _term_on_state_vectors(term: Energy, space: mf.Space) -> Energy:
+    """Return one term of an energy of points of a space as an energy of their vectors."""
     if isinstance(term, TimeDependent):
-        return TimeDependent(_PointTimeFunction(term.function, space))
-    return term if isinstance(term, Quadratic) else PointEnergy(term, space)
+        return TimeDependent(_PointTimeFunctionOnVectors(term.function, space))
+    return term if isinstance(term, Quadratic) else PointEnergyOnVectors(term, space)
 
 
-class _PointTimeFunction(Module):
-    """A function of a point and the time, as a function of the vector of the point and the time."""
+class _PointTimeFunctionOnVectors(Module):
+    """A function of a point of a space and the time, evaluated on the vector that holds the point."""
 
     function: Callable
     space: mf.Space = eqx.field(static=True)
@@ -63,7 +68,7 @@ class _PointTimeFunction(Module):
         return self.function(self.space.from_vector(x), t)
 
 
-def flatten_site_functions(tree, shape: tuple[int, ...]):
+def functions_of_flat_states(tree, shape: tuple[int, ...]):
     """Return a pytree with plain functions of states of this shape replaced by functions of flat states, shape (n,).
 
     Energies of other classes and Casimirs of algebras are functions of flat states already.
@@ -71,26 +76,27 @@ def flatten_site_functions(tree, shape: tuple[int, ...]):
     if len(shape) == 1:
         return tree
     return jax.tree_util.tree_map(
-        lambda node: _flatten_site_energy(node, shape) if isinstance(node, Energy) else node,
+        lambda node: _energy_of_flat_states(node, shape) if isinstance(node, Energy) else node,
         tree,
         is_leaf=lambda node: isinstance(node, Energy),
     )
 
 
-def _flatten_site_energy(energy: Energy, shape: tuple[int, ...]) -> Energy:
+def _energy_of_flat_states(energy: Energy, shape: tuple[int, ...]) -> Energy:
+    """Return an energy whose plain functions of states of this shape became functions of flat states."""
     if isinstance(energy, Sum):
-        return Sum(tuple(_flatten_site_energy(term, shape) for term in energy.summands))
+        return Sum(tuple(_energy_of_flat_states(term, shape) for term in energy.summands))
     if isinstance(energy, Negative):
-        return Negative(_flatten_site_energy(energy.term, shape))
+        return Negative(_energy_of_flat_states(energy.term, shape))
     if isinstance(energy, Multiple):
-        return Multiple(_flatten_site_energy(energy.term, shape), energy.factor)
+        return Multiple(_energy_of_flat_states(energy.term, shape), energy.factor)
     if isinstance(energy, Function | TimeDependent):
         is_flat = getattr(energy.function, "dim", None) == math.prod(shape)  # a Casimir of the whole algebra
-        return energy if is_flat else type(energy)(_FlattenedFunction(energy.function, shape))
+        return energy if is_flat else type(energy)(_FunctionOfFlatState(energy.function, shape))
     return energy
 
 
-class _FlattenedFunction(Module):
+class _FunctionOfFlatState(Module):
     """A function of states of some shape, as a function of flat states."""
 
     function: Callable
@@ -98,14 +104,14 @@ class _FlattenedFunction(Module):
 
     @property
     def __name__(self) -> str:
-        return getattr(self.function, "__name__", type(self.function).__name__)
+        return callable_name(self.function)
 
     def __call__(self, x, *time):
         return self.function(x.reshape(self.shape), *time)
 
 
 @dataclass(frozen=True)
-class Spheres:
+class SphereLengths:
     """A :class:`.surface.Surface` of states whose first ``count`` vectors of three components have constant lengths.
 
     Attributes
@@ -145,13 +151,16 @@ class Spheres:
         return x, compensation
 
     def _leading_vectors(self, v) -> VectorComponents:
+        """Return the first ``count`` vectors of three components of a flat array, by components."""
         return spins_from_state(v, self.count, self.planar)
 
     def _replace_vectors(self, v, vectors: VectorComponents) -> jax.Array:
+        """Return a flat array with its first ``count`` vectors replaced."""
         return state_from_spins(vectors, v[3 * self.count :], self.planar)
 
 
 def _safe_quotient(numerator, square) -> jax.Array:
+    """Return a quotient; a divisor that is not positive is replaced by 1."""
     return numerator / jnp.where(square > 0.0, square, 1.0)
 
 
@@ -180,53 +189,57 @@ class HalfSquareOfSpin(Energy):
         return 0.5 * jnp.sum(x[3 * self.site : 3 * self.site + 3] ** 2)
 
 
-def to_component_order(x, count: int) -> jax.Array:
-    """Return states, shape (..., n), whose first ``count`` spins are reordered component by component."""
-    return _transpose_spins(x, (count, 3))
+def spins_to_component_order(x, n_spins: int) -> jax.Array:
+    """Return states, shape (..., n), whose first ``n_spins`` spins are reordered component by component."""
+    return _transpose_spins(x, (n_spins, 3))
 
 
-def to_site_order(x, count: int) -> jax.Array:
-    """Return states, shape (..., n), whose first ``count`` spins are reordered site by site."""
-    return _transpose_spins(x, (3, count))
+def spins_to_site_order(x, n_spins: int) -> jax.Array:
+    """Return states, shape (..., n), whose first ``n_spins`` spins are reordered site by site."""
+    return _transpose_spins(x, (3, n_spins))
 
 
-def _transpose_spins(x, shape: tuple[int, int]) -> jax.Array:
-    batch_shape, n_spin_components = x.shape[:-1], shape[0] * shape[1]
+def _transpose_spins(x, stored_shape: tuple[int, int]) -> jax.Array:
+    """Return states, shape (..., n), with the leading matrix of spins, stored in this shape, transposed."""
+    batch_shape, n_spin_components = x.shape[:-1], stored_shape[0] * stored_shape[1]
     spins = x if n_spin_components == x.shape[-1] else x[..., :n_spin_components]
-    spins = jnp.swapaxes(spins.reshape(*batch_shape, *shape), -1, -2).reshape(*batch_shape, n_spin_components)
+    spins = jnp.swapaxes(spins.reshape(*batch_shape, *stored_shape), -1, -2).reshape(*batch_shape, n_spin_components)
     return spins if n_spin_components == x.shape[-1] else jnp.concatenate([spins, x[..., n_spin_components:]], axis=-1)
 
 
-def energy_in_component_order(energy: Energy, count: int) -> Energy:
-    """Return a function of states ordered site by site as a function of states ordered component by component."""
+def energy_in_component_order(energy: Energy, n_spins: int) -> Energy:
+    """Return an energy of states whose spins are ordered site by site as an energy of states ordered by component."""
     terms: list[Energy] = []
     spin_energies: list[SpinEnergy] = []
     for term in energy.terms:
-        if isinstance(term, SpinEnergy) and math.prod(term.sites) == count:
+        if isinstance(term, SpinEnergy) and math.prod(term.sites) == n_spins:
             if term.is_quadratic:
                 spin_energies.append(term)
             else:  # each term has a discrete gradient of its own
                 terms.append(PlanarSpinEnergy((term,)))
         else:
-            terms.append(_term_in_component_order(term, count))
+            terms.append(_term_in_component_order(term, n_spins))
     if spin_energies:
         terms.append(PlanarSpinEnergy(tuple(spin_energies)))
-    return Sum.of(terms)
+    return Sum.from_terms(terms)
 
 
-def _term_in_component_order(term: Energy, count: int) -> Energy:
+def _term_in_component_order(term: Energy, n_spins: int) -> Energy:
     """Return one summand of an energy as a function of states that are ordered component by component."""
     if isinstance(term, BodyBathsEnergy):
-        return BodyBathsEnergy(energy_in_component_order(term.body, count), term.baths, term.body_dim, term.dim)
+        return BodyBathsEnergy(energy_in_component_order(term.body, n_spins), term.baths, term.body_dim, term.dim)
     if isinstance(term, Negative):
-        return Negative(energy_in_component_order(term.term, count))
+        return Negative(energy_in_component_order(term.term, n_spins))
     if isinstance(term, Multiple):
-        return Multiple(energy_in_component_order(term.term, count), term.factor)
-    return Pullback(term, SiteOrder(count))
+        return Multiple(energy_in_component_order(term.term, n_spins), term.factor)
+    return Pullback(term, ComponentToSiteOrder(n_spins))
 
 
 class PlanarSpinEnergy(Energy):
-    """A sum of energies of all spins; their gradients are added on the lattice, then copied to the state once."""
+    """A sum of spin energies, as a function of states whose spins are ordered component by component.
+
+    The gradients are added on the lattice, then copied to the state once.
+    """
 
     spin_energies: tuple[SpinEnergy, ...]
 
@@ -278,10 +291,10 @@ def interaction_range(energy: Energy, sites: tuple[int, ...]) -> tuple[int, ...]
     return tuple(max(axis_ranges) for axis_ranges in zip(*ranges, strict=True))
 
 
-class SiteOrder(ComponentMap):
+class ComponentToSiteOrder(ComponentMap):
     """A map from states ordered component by component to states ordered site by site."""
 
     count: int = eqx.field(static=True)
 
     def __call__(self, x):
-        return to_site_order(x, self.count)
+        return spins_to_site_order(x, self.count)

@@ -28,7 +28,7 @@ class KronrodRule(NamedTuple):
 
 
 class CollocationPath(NamedTuple):
-    """The collocation polynomial of a step, in the coordinates that a term depends on.
+    """The collocation polynomial of a step, in the coordinates on which a term of an energy depends.
 
     Attributes
     ----------
@@ -57,7 +57,10 @@ class CollocationPath(NamedTuple):
     kronrod: KronrodRule | None
 
     def path_and_pullback_in(self, coordinates: Callable) -> tuple[CollocationPath, Callable]:
-        """Return the path in at most quadratic coordinates y(x), and the pullback of covectors at its stages to x."""
+        """Return the path in coordinates y(x), at most quadratic, and the function that pulls covectors back to x.
+
+        That function takes covectors at the stages, shape (s, number of coordinates).
+        """
 
         def push_forward(x, d):
             return jax.jvp(coordinates, (x,), (d,))

@@ -72,7 +72,7 @@ def value_and_rounding_scale(function: Callable, x) -> tuple[jax.Array, jax.Arra
     return exact_result, jnp.where(jnp.isfinite(rounding_scale), rounding_scale, 0.0)
 
 
-def propagated_rounding_scale(function: Callable, x, scales) -> jax.Array:
+def propagated_rounding_scale(function: Callable, x, input_scales) -> jax.Array:
     """Return the scale at which ``function(x)`` is rounded, to first order, if x is rounded too.
 
     Infinitesimal perturbations do not change any decision of the function: a jump does not count as rounding.
@@ -80,14 +80,14 @@ def propagated_rounding_scale(function: Callable, x, scales) -> jax.Array:
     Parameters
     ----------
     function : function from an array, shape (n,), to a number
-    scales : array, shape (n,)
+    input_scales : array, shape (n,)
         The components of x are known to about eps times these scales.
     """
     closed_jaxpr = jax.make_jaxpr(function)(x)
 
     def evaluate_perturbed(amplitudes):
         numbers = itertools.count()
-        perturbed_x = x + (_perturb(scales, next(numbers), amplitudes) - scales)
+        perturbed_x = x + (_perturb(input_scales, next(numbers), amplitudes) - input_scales)
         return _evaluate_perturbed(closed_jaxpr.jaxpr, closed_jaxpr.consts, [perturbed_x], numbers, amplitudes)[0]
 
     zero_amplitudes = jnp.zeros(PERTURBATION_SAMPLES)
@@ -97,7 +97,7 @@ def propagated_rounding_scale(function: Callable, x, scales) -> jax.Array:
     return jnp.max(jnp.abs(jnp.stack(derivatives)))
 
 
-def _evaluate_perturbed(jaxpr: Jaxpr, constants, arguments, numbers: Iterator[int], amplitudes) -> list:
+def _evaluate_perturbed(jaxpr: Jaxpr, constants, arguments, pattern_numbers: Iterator[int], amplitudes) -> list:
     """Return the results of a jaxpr in which the result of each equation is perturbed, by relative amplitudes."""
     values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments], strict=True))
     for equation in jaxpr.eqns:
@@ -108,12 +108,12 @@ def _evaluate_perturbed(jaxpr: Jaxpr, constants, arguments, numbers: Iterator[in
             if _is_routine_call(equation):
                 routine = jax.jit(
                     lambda inputs, amplitudes, i=inner: _evaluate_perturbed(
-                        i.jaxpr, i.consts, inputs, numbers, amplitudes
+                        i.jaxpr, i.consts, inputs, pattern_numbers, amplitudes
                     )
                 )
                 results = routine(inputs, amplitudes)
             else:
-                results = _evaluate_perturbed(inner.jaxpr, inner.consts, inputs, numbers, amplitudes)
+                results = _evaluate_perturbed(inner.jaxpr, inner.consts, inputs, pattern_numbers, amplitudes)
         else:
             bind_params = equation.primitive.get_bind_params(parameters)
             # older versions of JAX return (functions, parameters)
@@ -121,7 +121,7 @@ def _evaluate_perturbed(jaxpr: Jaxpr, constants, arguments, numbers: Iterator[in
             results = equation.primitive.bind(*functions, *inputs, **parameters)
             results = results if equation.primitive.multiple_results else [results]
             if name not in EXACT_PRIMITIVES:
-                results = [_perturb(value, next(numbers), amplitudes) for value in results]
+                results = [_perturb(value, next(pattern_numbers), amplitudes) for value in results]
         values.update(zip(equation.outvars, results, strict=True))
     return [v.val if isinstance(v, Literal) else values[v] for v in jaxpr.outvars]
 
@@ -141,28 +141,28 @@ def _is_iteration(equation) -> bool:
     return any(inner.primitive.name in ("scan", "while") for inner in equation.params["call_jaxpr"].jaxpr.eqns)
 
 
-def _perturb(value, number: int, amplitudes):
-    """Return a value with pattern ``number`` of each amplitude added to it, relative to its entries."""
+def _perturb(value, pattern_number: int, amplitudes):
+    """Return a value with small random errors added, relative to its entries: a stored pattern times each amplitude."""
     if not jnp.issubdtype(jnp.result_type(value), jnp.inexact):
         return value
     shape = np.shape(value)[-1:]
     pattern = _stored_random_numbers if math.prod(shape) <= MAX_STORED_PATTERN_LENGTH else _pseudorandom_numbers
     errors = [
-        amplitude * pattern(shape, (number + PERTURBATION_SAMPLES * i) % PATTERNS_PER_SHAPE)
+        amplitude * pattern(shape, (pattern_number + PERTURBATION_SAMPLES * i) % PATTERNS_PER_SHAPE)
         for i, amplitude in enumerate(amplitudes)
     ]
     return value + (value * sum(errors[1:], errors[0])).astype(jnp.result_type(value))  # single precision is preserved
 
 
 @functools.cache
-def _stored_random_numbers(shape: tuple[int, ...], number: int) -> np.ndarray:
-    """Return random numbers of modulus 0.5 to 1 and random sign."""
-    rng = np.random.default_rng(number)
+def _stored_random_numbers(shape: tuple[int, ...], seed: int) -> np.ndarray:
+    """Return an array of random numbers of modulus 0.5 to 1 and random sign, the same at each call with a seed."""
+    rng = np.random.default_rng(seed)
     return rng.uniform(0.5, 1.0, shape) * rng.choice([-1.0, 1.0], shape)
 
 
-def _pseudorandom_numbers(shape: tuple[int, ...], number: int) -> jax.Array:
-    """Return pseudorandom numbers of modulus 0.5 to 1, from the fractional part of a large multiple of a sine."""
-    v = 43758.5453 * jnp.sin(12.9898 * jnp.arange(1.0, shape[0] + 1.0) + 78.233 * number)
+def _pseudorandom_numbers(shape: tuple[int, ...], seed: int) -> jax.Array:
+    """Return a vector of pseudorandom numbers of modulus 0.5 to 1, from fractional parts of multiples of a sine."""
+    v = 43758.5453 * jnp.sin(12.9898 * jnp.arange(1.0, shape[0] + 1.0) + 78.233 * seed)
     v = 2.0 * (v - jnp.floor(v)) - 1.0
     return jnp.where(v < 0.0, -0.5, 0.5) + 0.5 * v

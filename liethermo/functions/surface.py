@@ -158,12 +158,13 @@ class ConstraintSurface:
             change,
         )
 
-    def _correction_displacement(self, x, c) -> jax.Array:
-        """Return the displacement, shape (n,), that changes the constraints by c."""
-        v = self.space.to_vector(self.space._correction(self._point(x), c))
+    def _correction_displacement(self, x, constraint_change) -> jax.Array:
+        """Return the displacement of x, shape (n,), that changes the constraints by ``constraint_change``."""
+        v = self.space.to_vector(self.space._correction(self._point(x), constraint_change))
         return v if v.shape == x.shape else jnp.pad(v, (0, x.shape[0] - v.shape[0]))
 
     def _point(self, x) -> jax.Array:
+        """Return the point of the space that the first components of a state hold."""
         return self.space.from_vector(x[: self.space.size])
 
 
@@ -177,9 +178,9 @@ QUADRATURE_RTOL = 64.0 * EPS
 """Error of the quadrature, relative to the rounding scale of a constraint, above which values are subtracted."""
 
 
-def _gauss_rule(number: int) -> tuple[np.ndarray, np.ndarray]:
+def _gauss_rule(n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the nodes and weights of Gauss quadrature on [0, 1]."""
-    nodes, weights = np.polynomial.legendre.leggauss(number)
+    nodes, weights = np.polynomial.legendre.leggauss(n_nodes)
     return 0.5 * (nodes + 1.0), 0.5 * weights
 
 
@@ -198,5 +199,6 @@ def _constraint_degree(space: mf.Space) -> float:
 
 
 def _weighted_constraint_sum(space: mf.Space, x):
+    """Return a sum of the constraints of a space at a vector, with fixed weights that let no degrees cancel."""
     values = space._constraints(space.from_vector(x))
     return jnp.sum(values * jnp.cos(jnp.arange(1.0, values.shape[-1] + 1.0)))

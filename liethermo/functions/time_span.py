@@ -45,7 +45,7 @@ class TimeSpan(Module):
     def __init__(self, start=-np.inf, end=np.inf, breaks=()):
         self.start, self.end, self.breaks = (_time_array(t) for t in (start, end, breaks))
 
-    def interval_at(self, t) -> TimeSpan:
+    def interval_between_breaks_at(self, t) -> TimeSpan:
         """Return the interval between two breaks in which a step lies that starts at time t, shape ().
 
         The interval ends before a break, and starts after one, by the rounding error of the times. So a function
@@ -63,6 +63,7 @@ class TimeSpan(Module):
 
     @property
     def _break_tolerance(self) -> jax.Array:
+        """Distance up to which two times of the span count as equal."""
         largest_time = jnp.maximum(jnp.abs(self.start), jnp.max(jnp.abs(self.breaks)))
         return BREAK_RTOL * largest_time
 
@@ -72,6 +73,7 @@ class TimeSpan(Module):
 
 
 def _time_array(t) -> jax.Array:
+    """Return times as a float64 array of concrete numbers, even during a trace; a tracer is returned unchanged."""
     if is_traced(t):
         return t
     with jax.ensure_compile_time_eval():  # a number, even where something else is traced
@@ -80,6 +82,7 @@ def _time_array(t) -> jax.Array:
 
 @jax.custom_jvp
 def _clip(t, start, end) -> jax.Array:
+    """Return times clipped to the interval from start to end."""
     return jnp.where(t > end, end, jnp.where(t < start, start, t))
 
 
@@ -104,7 +107,7 @@ def set_time_span(tree, start: float, end: float, *breaks: float):
 
 
 def replace_time_span(tree, span: TimeSpan):
-    """Return a pytree with another span in every place."""
+    """Return a pytree with each :class:`TimeSpan` in it replaced by another one."""
 
     def replace_span(node):
         return span if isinstance(node, TimeSpan) else node
@@ -211,7 +214,7 @@ class StateTimeFunction(Module):
 
 
 class LastArgumentIgnored(Module):
-    """A function that accepts one more argument, the last, and ignores it."""
+    """A function called with one argument more, the last, which it ignores."""
 
     function: Callable
 
@@ -264,12 +267,12 @@ def is_spline(value: Any) -> bool:
     """Return whether a value is a spline of SciPy, a function of one number from which a table can be made."""
     if "scipy.interpolate" not in sys.modules:  # then there is none
         return False
-    return isinstance(value, (*_splines_with_axis(), scipy.interpolate.UnivariateSpline))
+    return isinstance(value, (*_spline_classes_with_axis(), scipy.interpolate.UnivariateSpline))
 
 
 @functools.cache
-def _splines_with_axis() -> tuple[Any, ...]:
-    """Return the splines of SciPy whose values may be arrays, with the times along any axis."""
+def _spline_classes_with_axis() -> tuple[Any, ...]:
+    """Return SciPy's classes of splines whose values may be arrays, with the times along any axis."""
     return scipy.interpolate.PPoly, scipy.interpolate.BPoly, scipy.interpolate.BSpline
 
 
@@ -281,7 +284,7 @@ class PiecewiseConstant(FunctionWithBreaks):
     Parameters
     ----------
     times : sequence of float, length m
-        Increasing times of the jumps. They are no parameters of a system: they decide where steps end.
+        Increasing times of the jumps. They are not parameters of a system, because they decide where steps end.
     values : array, shape (m - 1, ...)
         The values between two of the times.
 
@@ -302,11 +305,48 @@ class PiecewiseConstant(FunctionWithBreaks):
 
     def __init__(self, times, values):
         self.times, self.values = checked_breaks(times), checked_numbers(values, "values")
-        if self.times != tuple(np.asarray(times, dtype=np.float64)) or self.values.shape[:1] != (len(self.times) - 1,):
+        if self.times != tuple(np.asarray(times, dtype=np.float64)):
+            raise InputError("the times of PiecewiseConstant must increase. Merge pulses that begin or end together")
+        if self.values.shape[:1] != (len(self.times) - 1,):
             raise InputError(
-                "PiecewiseConstant needs increasing times and one value for each interval between two of them, got "
-                f"{len(times)} times and values of shape {self.values.shape}"
+                f"PiecewiseConstant with {len(self.times)} times needs {len(self.times) - 1} values, one for each "
+                f"interval, got values of shape {self.values.shape}. Outside of these times it is zero"
             )
+
+    @classmethod
+    def from_pulses(cls, starts, ends, values) -> PiecewiseConstant:
+        """Return the sum of rectangular pulses, which may overlap, such as the firings of thrusters.
+
+        Parameters
+        ----------
+        starts, ends : sequence of float, length m
+            Times at which each pulse starts and ends.
+        values : array, shape (m, ...)
+            The value of each pulse between these times.
+
+        Raises
+        ------
+        InputError
+            If a pulse does not end after its start, or the lengths differ.
+
+        Examples
+        --------
+        >>> levels = lt.PiecewiseConstant.from_pulses([1.0, 2.0], [3.0, 4.0], [0.5, 1.0])
+        >>> [float(levels(t)) for t in (0.0, 1.5, 2.5, 3.5, 4.5)]
+        [0.0, 0.5, 1.5, 1.0, 0.0]
+        """
+        begins, finishes = checked_numbers(starts, "starts"), checked_numbers(ends, "ends")
+        heights = checked_numbers(values, "values")
+        if begins.ndim != 1 or begins.shape != finishes.shape or heights.shape[:1] != begins.shape:
+            raise InputError(
+                f"from_pulses needs one start, one end and one value for each pulse, got the shapes {begins.shape}, "
+                f"{finishes.shape} and {heights.shape}"
+            )
+        times = np.array(checked_breaks(np.concatenate([begins, finishes])))
+        if not bool(np.all(np.asarray(finishes) > np.asarray(begins))):
+            raise InputError("each pulse must end after its start")
+        is_on = (np.asarray(begins)[:, None] <= times[:-1]) & (times[:-1] < np.asarray(finishes)[:, None])
+        return cls(times, jnp.tensordot(is_on.T.astype(float), heights, 1))
 
     @property
     def break_times(self) -> tuple[float, ...]:
@@ -370,7 +410,7 @@ class Table(FunctionWithBreaks):
         if callable(times):
             if values is not None:
                 raise InputError("give values= only with an array of times: a spline has its values")
-            self.times, self.coefficients = _pieces_of_spline(times)
+            self.times, self.coefficients = _breakpoints_and_coefficients(times)
             self.values, self.shape = None, self.coefficients.shape[2:]
             return
         if values is None or callable(values):
@@ -387,7 +427,7 @@ class Table(FunctionWithBreaks):
         self.shape, self.coefficients = self.values.shape[1:], None
         if kind == "cubic":
             spline = scipy.interpolate.CubicSpline(np.asarray(self.times), np.asarray(self.values))
-            self.times, self.coefficients = _pieces_of_spline(spline)
+            self.times, self.coefficients = _breakpoints_and_coefficients(spline)
             self.values = None
 
     @classmethod
@@ -443,7 +483,7 @@ class ContinuedSpline(FunctionWithBreaks):
     coefficients: jax.Array
 
     def __init__(self, spline: Any):
-        self.times, self.coefficients = _pieces_of_spline(spline)
+        self.times, self.coefficients = _breakpoints_and_coefficients(spline)
 
     @property
     def known_span(self) -> tuple[float, float]:
@@ -476,17 +516,17 @@ def interval_index(times: jax.Array, t) -> jax.Array:
     return index
 
 
-def _pieces_of_spline(spline: Any) -> tuple[jax.Array, jax.Array]:
+def _breakpoints_and_coefficients(spline: Any) -> tuple[jax.Array, jax.Array]:
     """Return the times, shape (m,), and the ascending coefficients, shape (m - 1, order, ...), of a SciPy spline."""
-    axis = spline.axis if isinstance(spline, _splines_with_axis()) else 0
+    axis = spline.axis if isinstance(spline, _spline_classes_with_axis()) else 0
     if axis != 0:
         raise InputError(f"a spline must interpolate along axis 0, got axis {axis}")
     if isinstance(spline, scipy.interpolate.BPoly):
         spline = scipy.interpolate.PPoly.from_bernstein_basis(spline)
     elif isinstance(spline, scipy.interpolate.UnivariateSpline):
-        spline = _bspline_on_its_interval(scipy.interpolate.BSpline(*spline._eval_args))
+        spline = _bspline_to_piecewise_polynomial(scipy.interpolate.BSpline(*spline._eval_args))
     elif isinstance(spline, scipy.interpolate.BSpline):
-        spline = _bspline_on_its_interval(spline)
+        spline = _bspline_to_piecewise_polynomial(spline)
     if not isinstance(spline, scipy.interpolate.PPoly):
         raise InputError(
             "a table must be a piecewise polynomial of SciPy, or times and values, got "
@@ -501,7 +541,7 @@ def _pieces_of_spline(spline: Any) -> tuple[jax.Array, jax.Array]:
     return jnp.asarray(times), jnp.asarray(np.moveaxis(coefficients[::-1], 0, 1).astype(float))
 
 
-def _bspline_on_its_interval(spline: Any) -> Any:
+def _bspline_to_piecewise_polynomial(spline: Any) -> Any:
     """Return a B-spline of degree k as piecewise polynomials, from its knot k to the last knot but k."""
     start, end = spline.t[spline.k], spline.t[-spline.k - 1]
     breakpoints = np.unique(spline.t[(spline.t >= start) & (spline.t <= end)])

@@ -344,11 +344,6 @@ def checked_stages(stages) -> int:
     return stages
 
 
-def kind_or_class_name(value) -> str:
-    """Return the kind of a system, or the class name of any other object."""
-    return value.kind if isinstance(value, System) else type(value).__name__
-
-
 def checked_step_size(h) -> jax.Array:
     """Return the step size h as a scalar array; raise InputError if it is zero or not finite."""
     h = checked_numbers(h, "the step h", ())

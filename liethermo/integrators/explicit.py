@@ -17,7 +17,7 @@ from ..dissipation.base import terms_with_preserved_values
 from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.gradients import EPS
-from ..systems import ChartSystem, System, TurningSystem
+from ..systems import System, TurningSystem
 from ..systems.transport import generator_field, has_generator
 from .base import OneStepMethod, TransportingMethod
 from .charts import InCharts, wrap_in_charts
@@ -201,7 +201,7 @@ class ExplicitMethod(TransportingMethod):
         """Raise InputError unless the system has a law to hold and conserves the functions that are to be preserved."""
         if not self._laws_to_hold(system):
             raise InputError(
-                f"{self} needs a system with an energy or entropy law, and this one has none. Use lt.Reference"
+                f"{self} needs a system with an energy or entropy law, but this one has none. Use lt.Reference"
             )
         check_preserved(system, self.functions)
 
@@ -243,7 +243,7 @@ class ExplicitMethod(TransportingMethod):
         )
         if follow_leaf:
             d, error, interpolation_rows = d[n:], error[:n], interpolation_rows[:, :n]
-        if not isinstance(system, ChartSystem):  # in charts the initial levels are new at every step
+        if system.hints.has_fixed_levels:
             changes = changes + self._drift_correction_changes(
                 system, laws, start_gradients, x, compensation, k[StepRow.INITIAL_LEVELS], follow_leaf
             )

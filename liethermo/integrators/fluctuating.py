@@ -184,7 +184,7 @@ def stochastic_method(
     if not isinstance(method, MetriplecticMidpoint):
         raise InputError(f"noise= works only with lt.MetriplecticMidpoint, got {method}")
     if all(part.is_noiseless for part in system.total_dissipation.terms):
-        raise InputError("noise= needs a system with a dissipation that has noise, and this one has none")
+        raise InputError("noise= needs a dissipation with noise, but this system has none")
     lowering_terms = [part for part in system.total_dissipation.terms if part.energy_law != "conserved"]
     if lowering_terms and temperature is None:
         raise InputError(

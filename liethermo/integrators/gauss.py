@@ -20,7 +20,7 @@ from ..dissipation.base import Dissipation, terms_with_preserved_values
 from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.frames import OrthonormalFrame, gram_schmidt
-from ..functions.gradients import CorrectionDirection, FunctionChange, correct_gradients, stage_gradients
+from ..functions.gradients import CorrectionDirection, FunctionChange, correct_gradients, discrete_gradients_at_stages
 from ..systems import System
 from ..systems.invariants import preserved_by_name, preserved_names, stack_gradients
 from ..systems.transport import has_generator
@@ -75,10 +75,10 @@ def composed_entropy_gradients(
         return casimir_gradient_frame(y).coefficients(S.gradient(y))
 
     coefficients = jax.vmap(entropy_coefficients)(h * (A @ rates))
-    entropy_change = FunctionChange.of(S, x, compensation, h * (b @ k), [])
+    entropy_change = FunctionChange.from_step(S, x, compensation, h * (b @ k), [])
     return jnp.einsum(
         "ij,jin->in",
-        correct_gradients(entropy_change, coefficients, rates, CorrectionDirection.of(rates, b), h, b),
+        correct_gradients(entropy_change, coefficients, rates, CorrectionDirection.from_slopes(rates, b), h, b),
         gradients,
     )
 
@@ -195,8 +195,8 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     preserves = frozenset({"energy", "entropy_law", "casimirs"})
 
     def check(self, system: System) -> None:
-        """Raise InputError unless the system conserves the preserved functions, and these are fewer than its
-        dimensions."""
+        """Raise InputError unless the system conserves the preserved functions, which must be fewer than the
+        components of a state."""
         check_preserved(system, self.functions)
         if not self.functions:
             return
@@ -249,7 +249,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
             if C.is_quadratic:
                 return StageGradients(continuous, continuous)
             return StageGradients(
-                stage_gradients(C, x, compensation, h, k, A, b, kronrod_rule(self.number)), continuous
+                discrete_gradients_at_stages(C, x, compensation, h, k, A, b, kronrod_rule(self.number)), continuous
             )
 
         S, entropy_functions = _entropy_if_used(system), _functions_determining_entropy(system)
@@ -274,7 +274,9 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         """Return gradients of the energy at the stages u, shape (s, n), corrected so that their work is its change."""
         A, b, _ = gauss_tableau(self.number)
         symmetries = self._symmetry_directions(system, u)
-        return stage_gradients(system.energy, x, compensation, h, k, A, b, kronrod_rule(self.number), symmetries)
+        return discrete_gradients_at_stages(
+            system.energy, x, compensation, h, k, A, b, kronrod_rule(self.number), symmetries
+        )
 
     def _stage_slope(self, system: System, u, dH, dS, gradients_by_name: dict[str, StageGradients]) -> jax.Array:
         """Return the slope of one stage, ``Pi_d dH + K_d dS`` with discrete Poisson and friction matrices."""

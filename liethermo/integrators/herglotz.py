@@ -20,7 +20,8 @@ from ..functions.conditions import checked_numbers
 from ..functions.energy import Energy, make_energy
 from ..functions.surface import ConstraintSurface
 from ..functions.time_span import required_argument_count
-from ..systems import EmbeddedSystem, EvolutionSystem, System
+from ..systems import EvolutionSystem, System
+from ..systems.kinds import require_kind, user_system
 from .base import WHY_FIXED_VARIATIONAL_STEP, OneStepMethod, apply_increment, checked_step_size
 
 _SUZUKI_OUTER_FRACTION = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
@@ -140,9 +141,7 @@ class DiscreteHerglotz(OneStepMethod):
 
     def check(self, system: System) -> None:
         """Raise InputError unless the state has the form (q, p, S)."""
-        system = _unembedded_system(system)
-        if not isinstance(system, EvolutionSystem):
-            raise InputError(f"DiscreteHerglotz needs an lt.EvolutionSystem, got a {system.kind}")
+        system = _evolution_system(system)
         space = system.configurations
         self._check_discrete_lagrangian((system.dim // 2,) if space is None else space.shape)
 
@@ -165,8 +164,7 @@ class DiscreteHerglotz(OneStepMethod):
         return np.array([share for share, _ in SUBSTEPS[self.composed]])
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
-        system = _unembedded_system(system)
-        assert isinstance(system, EvolutionSystem)
+        system = _evolution_system(system)
         space, y, slopes, n = system.configurations, x + compensation, [], len(x) // 2
         action = self.discrete_lagrangian if space is None else _ActionOfFlatArrays(self.discrete_lagrangian, space)
         for (fraction, is_forward), guess in zip(SUBSTEPS[self.composed], k, strict=True):
@@ -232,9 +230,9 @@ def _newton_velocity(residual: Callable, contact: mf.SplitContact, q, h, velocit
     return velocity_guess - solve(A, residual_value[:, None])[:, 0]
 
 
-def _unembedded_system(system: System) -> System:
-    """Return the system on a manifold that an embedded system wraps; any other system unchanged."""
-    return system.manifold if isinstance(system, EmbeddedSystem) else system
+def _evolution_system(system: System) -> EvolutionSystem:
+    """Return the evolution system itself, or the one on a manifold that an embedded system wraps."""
+    return require_kind(user_system(system), EvolutionSystem, "DiscreteHerglotz")
 
 
 class _ActionOfFlatArrays(Module):

@@ -16,8 +16,9 @@ from manifolds.matrices.linear import adjoint
 
 from ..dissipation.lindblad import LindbladJumps
 from ..errors import InputError
-from ..systems import DrivenSystem, QuantumSystem, System
-from .base import OneStepMethod, kind_or_class_name, register
+from ..systems import QuantumSystem, System
+from ..systems.kinds import require_kind, user_system
+from .base import OneStepMethod, register
 from .explicit import StepRow
 from .runge_kutta import END_SLOPE_ROW, hermite_cubic_weights
 
@@ -91,10 +92,7 @@ class KrausMethod(OneStepMethod):
 
     def check(self, system: System) -> None:
         """Raise InputError unless the system is a QuantumSystem with LindbladJumps and no other dissipation."""
-        body = system.body if isinstance(system, DrivenSystem) else system
-        if not isinstance(body, QuantumSystem):
-            raise InputError(f"KrausMethod needs an lt.QuantumSystem, got a {kind_or_class_name(body)}")
-        terms = body.total_dissipation.terms
+        terms = _undriven_quantum_system(system).total_dissipation.terms
         if not terms or not all(isinstance(term, LindbladJumps) for term in terms):
             raise InputError(
                 "KrausMethod needs lt.LindbladJumps and no other dissipation. For lt.ThermalJumps use "
@@ -108,13 +106,13 @@ class KrausMethod(OneStepMethod):
         """Return the rows of :class:`.explicit.StepRow`, followed by the slopes at both ends."""
         x = x + compensation
         body, n, clock_time = _undriven_quantum_system(system), _undriven_quantum_system(system).body_dim, None
-        if isinstance(system, DrivenSystem):
-            clock_time = system.time(x)
+        if (clock := system.clock) is not None:
+            clock_time = clock.time(x)
         channel = _StepChannel.build(system, body.structure, clock_time, h, self.number)
         middle, end = channel.apply(x[:n])
         d = end - x[:n]
-        if isinstance(system, DrivenSystem):
-            d = jnp.concatenate([d, _clock_and_work_increments(system, x, h, middle, end)])
+        if clock is not None:
+            d = jnp.concatenate([d, _clock_and_work_increments(system, clock.unit, x, h, middle, end)])
         field = jax.vmap(system.vector_field)(jnp.stack([x, x + d]))
         zero = jnp.zeros_like(x)
         return jnp.stack([d / h, zero, zero, k[StepRow.INITIAL_LEVELS], *field])
@@ -153,9 +151,9 @@ class _StepChannel(NamedTuple):
         body = _undriven_quantum_system(system)
         fractions = (0.0, 0.25, 0.5, 1.0)
         frozen = dict.fromkeys(fractions, body)
-        if time is not None:
-            assert isinstance(system, DrivenSystem)
-            frozen = {c: _undriven_quantum_system(body.at_time(system.span.clip(time + c * h))) for c in fractions}
+        if time is not None and system.clock is not None:
+            span = system.clock.span
+            frozen = {c: body.at_time(span.clip(time + c * h)) for c in fractions}
         terms = [term for term in body.total_dissipation.terms if isinstance(term, LindbladJumps)]
 
         def operators(fraction) -> np.ndarray | jax.Array:
@@ -254,18 +252,16 @@ def _magnus_exponents(J0, J, J1, h, intervals) -> list[jax.Array]:
 
 def _undriven_quantum_system(system: System) -> QuantumSystem:
     """Return the quantum system itself, or the one that a driven system wraps."""
-    body = system.body if isinstance(system, DrivenSystem) else system
-    assert isinstance(body, QuantumSystem)
-    return body
+    return require_kind(user_system(system), QuantumSystem, "KrausMethod")
 
 
-def _clock_and_work_increments(system: DrivenSystem, x, h, middle, end) -> jax.Array:
+def _clock_and_work_increments(system: System, unit: float, x, h, middle, end) -> jax.Array:
     """Return the increments of the clock and of the work in a step, shape (2,); Simpson's rule integrates the power."""
     states = jnp.stack([x[:-2], middle, end])
-    times = x[-2] + jnp.array([0.0, 0.5, 1.0]) * h * system.unit
+    times = x[-2] + jnp.array([0.0, 0.5, 1.0]) * h * unit
     points = jnp.concatenate([states, times[:, None], jnp.zeros((3, 1))], axis=1)
     powers = jax.vmap(system.energy.gradient)(points)[:, -2]
-    return jnp.stack([h * system.unit, h * system.unit**2 * jnp.dot(SIMPSON_WEIGHTS, powers)])
+    return jnp.stack([h * unit, h * unit**2 * jnp.dot(SIMPSON_WEIGHTS, powers)])
 
 
 register(*map(KrausMethod, KRAUS_ORDERS))

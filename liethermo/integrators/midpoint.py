@@ -10,7 +10,7 @@ import jax
 import manifolds as mf
 from manifolds._pytree_module import forward_to
 
-from ..functions.gradients import DiscreteGradient, get_discrete_gradient
+from ..functions.gradients import DiscreteGradient, discrete_gradient_by_name
 from ..systems import System
 from ..systems.transport import has_generator
 from .base import OneStepMethod, TransportingMethod, collocation_error_estimate, generator_residual_jvp, register
@@ -58,7 +58,7 @@ class MetriplecticMidpoint(TransportingMethod):
     retraction: str | mf.Retraction | None = eqx.field(static=True)
 
     def __init__(self, gradient: str | DiscreteGradient = "gonzalez", retraction: str | mf.Retraction | None = None):
-        self.gradient = get_discrete_gradient(gradient)
+        self.gradient = discrete_gradient_by_name(gradient)
         self.retraction = retraction
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:

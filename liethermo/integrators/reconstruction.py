@@ -8,13 +8,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from manifolds._pytree_module import replace_fields
 from manifolds.groups.maps import central_part, components_from_ad_cayley, inverse_dexp
 from manifolds.matrices.linear import solve_near_identity
 
 from ..errors import InputError
 from ..functions.frames import vector_with_inner_products
 from ..functions.gradients import two_sum
-from ..systems import MOMENTUM_LESS_IMPULSE, SPATIAL_MOMENTUM, AttitudeSystem, DrivenSystem, TurningSystem
+from ..systems import MOMENTUM_LESS_IMPULSE, SPATIAL_MOMENTUM, AttitudeSystem, TurningSystem
 from ..systems.transport import is_torque_free
 from .base import MethodWrapper, TransportingMethod, pullback_method
 from .explicit import StepRow
@@ -89,8 +90,7 @@ class WithAttitude(MethodWrapper):
         return (self.explicit or follows) and self._transporting_method.can_transport_attitude(system.body)
 
     def check(self, system) -> None:
-        body = system.body
-        self.method.check(body.bind_attitude(system.group.identity) if isinstance(body, DrivenSystem) else body)
+        self.method.check(system.body.bind_attitude(system.group.identity))
 
     # -- the momentum, which the equations of a step are about --------------------------------------------------------
 
@@ -98,14 +98,16 @@ class WithAttitude(MethodWrapper):
         """Return the slopes of the momentum; for an explicit method also those of the rotation angles."""
         method, mu, mu_compensation = self.method, system.points(x), system.points(compensation)
         if self.explicit:
-            local = TurningSystem(system, self.order, system.split_state(x)[1])
+            local = TurningSystem(system, self.order, system.attitude_layout.split(x)[1])
             return pullback_method(method, local).slopes(
                 local, local.local_coordinates(x), local.local_coordinates(compensation), h, k
             )
         body = system.body
-        if not (isinstance(body, DrivenSystem) and body.torque_laws.needs_attitude):
+        if not body.torque_laws.needs_attitude:
             return method.slopes(body, mu, mu_compensation, h, k)
-        slopes_for_torque = jax.vmap(lambda torque: method.slopes(body.with_torque(torque), mu, mu_compensation, h, k))
+        slopes_for_torque = jax.vmap(
+            lambda torque: method.slopes(replace_fields(body, torque=torque), mu, mu_compensation, h, k)
+        )
         slopes_by_torque = slopes_for_torque(
             self._stage_torques(system, x, compensation, h, k)
         )  # all stages with the torques of all
@@ -114,7 +116,7 @@ class WithAttitude(MethodWrapper):
     def start(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
         if not self.explicit:
             return self.method.start(system.body_at_attitude(x), system.points(x))
-        mu, g = system.split_state(x)
+        mu, g = system.attitude_layout.split(x)
         local, n = TurningSystem(system, self.order, g), system.group.dim
         k = self.method.start(
             local, local.local_coordinates(x)
@@ -132,15 +134,20 @@ class WithAttitude(MethodWrapper):
         return jnp.sqrt(jnp.sqrt(jnp.sum((generator @ generator) ** 2)))
 
     def initial_compensation(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
-        mu, g = system.split_state(x)
+        layout = system.attitude_layout
+        mu, g = layout.split(x)
         attitude_correction = _correction_onto_group(system.group, g) if self.kind == "cayley" else jnp.zeros_like(g)
-        momentum = jnp.zeros_like(system.spatial_impulse(x)) if system.torque_laws.name else None
-        return system.join_state(self.method.initial_compensation(system.body, mu), attitude_correction, momentum)
+        momentum = jnp.zeros_like(layout.impulse(x)) if system.torque_laws.name else None
+        return layout.join(self.method.initial_compensation(system.body, mu), attitude_correction, momentum)
 
     # -- the attitude, which follows from it --------------------------------------------------------------------------
 
     def move(self, system: AttitudeSystem, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:  # type: ignore[override]
-        (mu, g), (mu_compensation, g_compensation) = system.split_state(x), system.split_state(compensation)
+        layout = system.attitude_layout
+        (mu, g), (mu_compensation, g_compensation) = (
+            layout.split(x),
+            layout.split(compensation),
+        )
         new_mu, new_mu_compensation = self.method.move(system.body, mu, mu_compensation, h, system.points(k))
         if self.explicit:
             return self._apply_explicit_step(system, x, compensation, new_mu, new_mu_compensation, h, k)
@@ -154,18 +161,17 @@ class WithAttitude(MethodWrapper):
         if self.kind == "cayley":
             dg = (g + g_compensation) @ _collocation_increment(system.group.algebra.hat(xi))
             new_g, new_g_compensation = two_sum(g, g_compensation + dg)
-            return system.join_state(new_mu, new_g, p), system.join_state(
+            return layout.join(new_mu, new_g, p), layout.join(
                 new_mu_compensation, new_g_compensation + _correction_onto_group(system.group, new_g), p_compensation
             )
         new_g = system.group.restore_map(g @ self._attitude_increment(system.group, xi))
-        return system.join_state(new_mu, new_g, p), system.join_state(
-            new_mu_compensation, jnp.zeros_like(g), p_compensation
-        )
+        return layout.join(new_mu, new_g, p), layout.join(new_mu_compensation, jnp.zeros_like(g), p_compensation)
 
     def _apply_explicit_step(
         self, system: AttitudeSystem, x, compensation, new_mu, new_mu_compensation, h, k
     ) -> tuple[jax.Array, jax.Array]:
-        g, group, n = system.split_state(x)[1], system.group, system.group.dim
+        layout = system.attitude_layout
+        g, group, n = layout.split(x)[1], system.group, system.group.dim
         local, step = TurningSystem(system, self.order, g), self.increment(h, k)
         new_g = g @ group.exp_map(group.algebra, local.angles(step))
         keeps_orbit, p_compensation = (
@@ -174,7 +180,8 @@ class WithAttitude(MethodWrapper):
         )
         if system.impulse_dim:
             p, p_compensation = two_sum(
-                system.spatial_impulse(x), system.spatial_impulse(compensation) + local.spatial_impulse(step)
+                layout.impulse(x),
+                layout.impulse(compensation) + local.spatial_impulse(step),
             )
             if keeps_orbit:
                 p, p_compensation = _project_onto_orbit(system.momentum_system, p, new_mu), jnp.zeros_like(p)
@@ -183,17 +190,18 @@ class WithAttitude(MethodWrapper):
         if keeps_orbit:
             new_g = _align_attitude(group, new_g, p, new_mu[:n])
         new_g = group.restore_map(new_g)
-        return system.join_state(new_mu, new_g, p if system.impulse_dim else None), system.join_state(
+        return layout.join(new_mu, new_g, p if system.impulse_dim else None), layout.join(
             new_mu_compensation, jnp.zeros_like(g), p_compensation
         )
 
     def step_without_compensation(self, system: AttitudeSystem, x, h) -> jax.Array:
         """Return the state after a step without compensated summation: see :class:`.MetriplecticRungeKutta`."""
-        g, group = system.split_state(x)[1], system.group
+        layout = system.attitude_layout
+        g, group = layout.split(x)[1], system.group
         local = TurningSystem(system, self.order, g)
         method: Any = pullback_method(self.method, local)
         end = method.step_without_compensation(local, local.local_coordinates(x), h)
-        return system.join_state(system.points(end), g @ group.exp_map(group.algebra, local.angles(end)))
+        return layout.join(system.points(end), g @ group.exp_map(group.algebra, local.angles(end)))
 
     def _attitude_increment(self, group, stage_angles) -> jax.Array:
         """Return the group element that rotates the attitude, for angles h xi at the stages, shape (stages, dim)."""
@@ -205,9 +213,10 @@ class WithAttitude(MethodWrapper):
 
     def _stage_attitudes(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:
         """Return the attitudes at which the torques of the stages are evaluated, shape (stages, m, m)."""
+        layout = system.attitude_layout
         (mu, g), (mu_compensation, g_compensation), group = (
-            system.split_state(x),
-            system.split_state(compensation),
+            layout.split(x),
+            layout.split(compensation),
             system.group,
         )
         xi = (
@@ -231,7 +240,6 @@ class WithAttitude(MethodWrapper):
     def _stage_torques(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:
         """Return the torques at the stages, shape (stages, body components without the clock)."""
         body, states = system.body, system.points(x) + (system.points(compensation) + h * (gauss_tableau(len(k)).A @ k))
-        assert isinstance(body, DrivenSystem)
         if not body.torque_laws.needs_attitude:
             return jax.vmap(body.external_torque)(states)
         attitudes = self._stage_attitudes(system, x, compensation, h, k)
@@ -241,18 +249,20 @@ class WithAttitude(MethodWrapper):
         self, system: AttitudeSystem, x, compensation, h, k, stage_angles
     ) -> tuple[jax.Array, jax.Array]:
         """Return the spatial momentum after the impulse of the step, and its compensation."""
+        layout = system.attitude_layout
         torques = self._stage_torques(system, x, compensation, h, k)[:, : system.group.dim]
         actions = _collocation_stages(-system.group.algebra.ad(stage_angles).swapaxes(-1, -2)).swapaxes(
             -1, -2
         )  # Ad(inverse(g)), relative
         impulse = h * jnp.einsum("i,ia,iab->b", gauss_tableau(len(stage_angles)).b, torques, actions)
-        spatial_impulse = impulse @ system.spatial_action(system.split_state(x)[1])
-        return two_sum(system.spatial_impulse(x), system.spatial_impulse(compensation) + spatial_impulse)
+        spatial_impulse = impulse @ system.spatial_action(layout.split(x)[1])
+        return two_sum(layout.impulse(x), layout.impulse(compensation) + spatial_impulse)
 
     def displace(self, system: AttitudeSystem, x, v) -> jax.Array:  # type: ignore[override]
         """Displace the momentum alone: functions evaluated inside a step depend on it only."""
-        mu, g = system.split_state(x)
-        return system.join_state(mu + system.points(v), g, system.spatial_impulse(x))
+        layout = system.attitude_layout
+        mu, g = layout.split(x)
+        return layout.join(mu + system.points(v), g, layout.impulse(x))
 
     @staticmethod
     def _coadjoint_increment(group, stage_angles) -> jax.Array:

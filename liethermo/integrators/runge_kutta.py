@@ -16,7 +16,7 @@ from ..systems import System
 from ..systems.clock import error_of_step
 from .base import register
 from .explicit import ExplicitMethod, StepRow, UncorrectedStep
-from .tableaus import LOBATTO_ORDERS, ErrorEstimate, ExplicitTableau, lobatto_tableau
+from .tableaus import LOBATTO_ORDERS, ErrorEstimate, ExplicitTableau, explicit_lobatto_tableau
 
 START_SLOPE_ROW = StepRow.FIRST_METHOD_ROW
 """Row of ``k`` that holds the slope at the start of a step."""
@@ -112,7 +112,7 @@ class MetriplecticRungeKutta(ExplicitMethod):
 
     @property
     def tableau(self) -> ExplicitTableau:
-        return lobatto_tableau(self.order)
+        return explicit_lobatto_tableau(self.order)
 
     def base_step(self, rates: Callable, skip_law_rates: bool, x, compensation, h) -> UncorrectedStep:
         t = self.tableau

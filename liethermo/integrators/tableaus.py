@@ -178,8 +178,11 @@ def _legendre_value(m: int, x) -> np.ndarray:
 
 
 @functools.cache
-def lobatto_tableau(order: int) -> ExplicitTableau:
-    """Return the tableau of order 4 [Kutta 1901], 6 [Butcher 1964] or 8 [Cooper & Verner 1972]."""
+def explicit_lobatto_tableau(order: int) -> ExplicitTableau:
+    """Return the explicit tableau with Lobatto weights of order 4 [Kutta 1901], 6 [Butcher 1964] or 8.
+
+    That of order 8 is by Cooper and Verner (1972).
+    """
     A, b = {4: _kutta_coefficients, 6: _butcher_coefficients, 8: _cooper_verner_coefficients}[order]()
     nodes = A.sum(axis=1)
     powers = [np.ones(len(b))]

@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..systems import System
 from ..systems.clock import error_of_step
 from ..systems.transport import has_generator
-from ..tracing.taylor import TaylorSeriesError, check_taylor_series, increment_taylor_coefficients
+from ..tracing.taylor import TaylorSeriesError, check_has_taylor_series, solution_taylor_coefficients
 from .base import OneStepMethod, register
 from .charts import resolve_retraction
 from .explicit import ExplicitMethod, StepRow, UncorrectedStep
@@ -116,7 +116,7 @@ class MetriplecticTaylor(ExplicitMethod):
             functions["the entropy"] = system.entropy.value
         for name, function in functions.items():
             try:
-                check_taylor_series(function, x)
+                check_has_taylor_series(function, x)
             except TaylorSeriesError as error:
                 raise error.add_context(
                     f"{self} needs Taylor series, and of {name} ", "take lt.MetriplecticRungeKutta"
@@ -134,7 +134,7 @@ class MetriplecticTaylor(ExplicitMethod):
             return space.to_vector(chart._point(z, space._from_coordinates(z, c)))
 
         try:
-            check_taylor_series(state_from_coordinates, jnp.zeros(space.dim))
+            check_has_taylor_series(state_from_coordinates, jnp.zeros(space.dim))
         except TaylorSeriesError as error:
             raise error.add_context(
                 f"{self} needs Taylor series, and of {chart} ",
@@ -144,7 +144,7 @@ class MetriplecticTaylor(ExplicitMethod):
     def base_step(self, rates: Callable, skip_law_rates: bool, x, compensation, h) -> UncorrectedStep:
         nodes, b = self._lobatto_rule
         powers = np.arange(1.0, self.order + 1.0)
-        c = increment_taylor_coefficients(
+        c = solution_taylor_coefficients(
             lambda y: rates(y)[0], x, h, self.order
         )  # compensation is left out: in a chart x is its centre, exactly
         points = jnp.concatenate([x[None], x + (compensation + nodes[1:, None] ** powers @ c)])

@@ -25,7 +25,7 @@ from .. import disk
 from ..errors import InputError
 from ..integrators import MetriplecticGauss, Reference
 from ..runs.integrate import integrate
-from ..systems import LiePoissonSystem, System
+from ..systems import System
 from ..tracing.program import Program
 from ..tracing.scalarize import scalarize
 
@@ -219,14 +219,14 @@ def describe(system: System, x0, t_span: tuple[float, float], name: str = "probl
         "t_span": [float(t) for t in t_span],
         "reference": _reference_solution(system, x0, t_span),
     }
-    if isinstance(system, LiePoissonSystem):
-        constants = mf.sympy.structure_constants(system.algebra)
+    if (algebra := system.lie_algebra) is not None:
+        constants = mf.sympy.structure_constants(algebra)
         problem["lie_algebra"] = {
-            "name": system.algebra.name,
-            "dimension": system.algebra.dim,
+            "name": algebra.name,
+            "dimension": algebra.dim,
             "structure_constants": [
                 [a + 1, b + 1, c + 1, str(constants[a, b, c])]
-                for a, b, c in np.argwhere(system.algebra.structure_constants).tolist()
+                for a, b, c in np.argwhere(algebra.structure_constants).tolist()
             ],
         }
     return problem

@@ -110,9 +110,7 @@ def _checked_trajectory(trajectory_index: int, t, x, system: System, observation
     except (TypeError, ValueError) as error:
         raise InputError(f"{name_of_trajectory} is not made of real numbers: {error}") from None
     if t.ndim != 1 or len(t) < 2:
-        raise InputError(
-            f"{name_of_trajectory} has {t.size} point{'s' if t.size != 1 else ''}: at least 2 tell of a motion"
-        )
+        raise InputError(f"{name_of_trajectory} has {t.size} time{'s' if t.size != 1 else ''}, at least 2 are needed")
     if x.ndim == 0 or len(x) != len(t):
         raise InputError(f"{name_of_trajectory} has {len(t)} times and {len(x) if x.ndim else 'no'} states")
     for name, values, is_invalid in (("time", t, ~np.isfinite(t)), ("state", x, np.isinf(x))):

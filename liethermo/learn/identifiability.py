@@ -161,8 +161,8 @@ class Fits:
         values = np.stack([np.asarray(quantity(system)) for system in self.systems])
         if (values == values[0]).all():
             warn(
-                "the quantity is equal in all fits, so its deviation of 0 is no error: the fits had the same data and "
-                "first weights, or it does not depend on what was learned. Give noise=, or more trajectories",
+                "the quantity is equal in all fits, so its deviation of 0 is not an error: the fits had the same data "
+                "and first weights, or it does not depend on what was learned. Give noise=, or more trajectories",
                 FitWarning,
             )
         return values.mean(axis=0), values.std(axis=0, ddof=1)

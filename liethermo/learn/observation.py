@@ -17,7 +17,7 @@ import manifolds as mf
 from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..functions.time_span import required_argument_count
 from ..results.solution import Solution
-from ..systems import AttitudeSystem, System
+from ..systems import System
 from ..tracing.index_check import checked_result_shapes
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 
@@ -78,9 +78,8 @@ class Observation(NamedTuple):
 
     def observe(self, prepared_system: System, state, t, parameters) -> jax.Array:
         """Return the observed quantities in a state of a run at time t, as a flat array of shape (k,)."""
-        x, attitude = (
-            prepared_system.split_state(state) if isinstance(prepared_system, AttitudeSystem) else (state, None)
-        )
+        layout = prepared_system.attitude_layout
+        x, attitude = (state, None) if layout is None else layout.split(state)
         return jnp.ravel(self.function(x, attitude, t, parameters))
 
     def fingerprint_parts(self, prepared_system: System, parameters) -> list:
@@ -117,14 +116,10 @@ class Observation(NamedTuple):
     def displace(self, prepared_system: System, state, z) -> jax.Array:
         """Return a state displaced by tangent coordinates z: x + z, and the attitude times the exponential of the
         remaining ones."""
-        if not isinstance(prepared_system, AttitudeSystem):
+        if (layout := prepared_system.attitude_layout) is None:
             return state + z
-        (x, g), n, group = (
-            prepared_system.split_state(state),
-            dim_without_attitude(prepared_system),
-            prepared_system.group,
-        )
-        return prepared_system.join_state(x + z[:n], g @ group.exp_map(group.algebra, z[n:]))
+        (x, g), n = layout.split(state), layout.body_dim
+        return layout.join(x + z[:n], g @ layout.group.exp_map(layout.group.algebra, z[n:]))
 
 
 def make_observation(
@@ -268,9 +263,7 @@ def states_from_observations(observation: Observation, prepared_system: System, 
     x = np.zeros((len(observations), dim_without_attitude(prepared_system)))
     if len(observation.component_indices):
         x[:, observation.component_indices] = observations
-    return (
-        np.asarray(prepared_system.initial_state(x, batch=True)) if isinstance(prepared_system, AttitudeSystem) else x
-    )
+    return x if prepared_system.attitude_layout is None else np.asarray(prepared_system.initial_state(x, batch=True))
 
 
 def states_matching_observations_and_rates(
@@ -360,11 +353,11 @@ def states_matching_observations_and_rates(
 
 def dim_without_attitude(prepared_system: System) -> int:
     """Return the number of state components that do not belong to the attitude."""
-    return prepared_system.body.dim if isinstance(prepared_system, AttitudeSystem) else prepared_system.dim
+    layout = prepared_system.attitude_layout
+    return prepared_system.dim if layout is None else layout.body_dim
 
 
 def n_displacement_coordinates(prepared_system: System) -> int:
     """Return the number of tangent coordinates by which :meth:`Observation.displace` moves a state."""
-    return dim_without_attitude(prepared_system) + (
-        prepared_system.group.dim if isinstance(prepared_system, AttitudeSystem) else 0
-    )
+    layout = prepared_system.attitude_layout
+    return dim_without_attitude(prepared_system) + (0 if layout is None else layout.group.dim)

@@ -14,6 +14,7 @@ from ..errors import FunctionError, InputError
 from ..runs.flow import system_with_parameters
 from ..runs.named_parameters import find_parameter
 from ..systems import System
+from ..systems.kinds import require_system
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from .losses import ParameterVector
 from .observation import entry_names
@@ -67,8 +68,7 @@ def build_with_parameters(system: System | Callable, parameter_values: Mapping[s
         built_system = system_with_parameters(system, parameter_values)
     except KeyError as error:
         raise InputError(f"the system needs the parameter {error}. Add it to parameters=") from None
-    if not isinstance(built_system, System):
-        raise InputError(f"the function that builds the system must return a system, got {type(built_system).__name__}")
+    require_system(built_system, "the function that builds the system must return a system")
     try:
         jax.eval_shape(
             lambda parameter_values: ravel_pytree(system_with_parameters(system, parameter_values))[0],

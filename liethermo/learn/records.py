@@ -79,7 +79,7 @@ class Records(Sequence[Trajectory], metaclass=ListedABCMeta):
         Raises
         ------
         InputError
-            If there is no column of a name.
+            If there is no column of this name.
         """
         for name in names:
             if name not in self.names:
@@ -219,7 +219,10 @@ class _Labels:
             problem = (
                 f"the columns {', '.join(matches)} may all be times" if matches else "the data have no column 'time'"
             )
-            raise InputError(f"{problem}; their columns are {', '.join(self.names)}. Name the times with time=")
+            raise InputError(
+                f"{problem}; their columns are {', '.join(self.names)}. Name the column of the times, such as "
+                f"lt.learn.read_data(data, time={(matches or list(self.names))[0]!r})"
+            )
         return matches[0]
 
     def unit_text(self, label: str) -> str:

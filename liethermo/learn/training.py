@@ -482,7 +482,7 @@ class TrainingRun:
         Raises
         ------
         FileError
-            If the file is no checkpoint, or of another fit.
+            If the file is not a checkpoint, or of another fit.
         """
         metadata, arrays = read_archive(path, CHECKPOINT_FORMAT)
         if metadata.get("identity") != self.fit_fingerprint:

@@ -22,7 +22,7 @@ from ..dissipation.base import Dissipation
 from ..dissipation.factor import Factor
 from ..functions.energy import Energy, Pullback, float64_array
 from ..functions.indices import Indices
-from ..tracing.programs import subprogram
+from ..tracing.programs import jit_subprogram
 
 
 class Poses(NamedTuple):
@@ -452,19 +452,19 @@ class KineticEnergy(Energy):
         return jax.lax.stop_gradient(_kinetic_rounding_scale(self, x))
 
 
-@subprogram
+@jit_subprogram
 def _kinetic_energy(kinetic: KineticEnergy, x) -> jax.Array:
     return kinetic.mechanism.kinetic_energy(*kinetic.split_state(x))
 
 
-@subprogram
+@jit_subprogram
 def _kinetic_gradient(kinetic: KineticEnergy, x) -> jax.Array:
     motion = kinetic.mechanism.motion(*kinetic.split_state(x))
     velocity = [] if kinetic.mechanism.is_fixed else [motion.angular_velocity]
     return jnp.concatenate([*velocity, motion.joint_gradient, motion.joint_rates])
 
 
-@subprogram
+@jit_subprogram
 def _kinetic_rounding_scale(kinetic: KineticEnergy, x) -> jax.Array:
     return kinetic.mechanism.motion(*kinetic.split_state(x)).rounding_scale
 
@@ -493,12 +493,12 @@ class WeightPotential(Energy):
         return jax.lax.stop_gradient(_weight_rounding_scale(self, x))
 
 
-@subprogram
+@jit_subprogram
 def _weight_potential(weight: WeightPotential, x) -> jax.Array:
     return weight.mechanism.weight_potential(x[: weight.mechanism.n_joints], weight.gravity)
 
 
-@subprogram
+@jit_subprogram
 def _weight_rounding_scale(weight: WeightPotential, x) -> jax.Array:
     mechanism, q = weight.mechanism, x[: weight.mechanism.n_joints]
     strokes = jnp.where(np.array(mechanism.slides), jnp.abs(q), 0.0)
@@ -507,7 +507,7 @@ def _weight_rounding_scale(weight: WeightPotential, x) -> jax.Array:
     return jnp.linalg.norm(weight.gravity) * jnp.dot(mechanism.masses, arms)
 
 
-@subprogram
+@jit_subprogram
 def _weight_gradient(weight: WeightPotential, x) -> jax.Array:
     k = weight.mechanism.n_joints
     return jnp.concatenate([-weight.mechanism.weight_forces(x[:k], weight.gravity), jnp.zeros(k)])

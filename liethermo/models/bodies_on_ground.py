@@ -92,6 +92,8 @@ class BodiesOnGround(TreeSystem, TorqueSystem):
         *,
         joints: Mapping[str, Any] | None = None,
         joint_rates: Mapping[str, Any] | None = None,
+        temperature=None,
+        degrees: bool = False,
     ) -> jax.Array:
         """Make a state of shape (2 k,) from joint coordinates and rates by name, or check an array of components.
 
@@ -106,6 +108,10 @@ class BodiesOnGround(TreeSystem, TorqueSystem):
             left out are zero.
         joint_rates : dict, as ``joints``; optional
             Rates of the joint coordinates (rad/s, or m/s); those left out are zero.
+        temperature : float, or array, shape (B, 1); optional
+            Temperature of the bath; by default that at zero entropy.
+        degrees : bool
+            If true, joint angles and their rates are in degrees and degrees/s.
 
         Returns
         -------
@@ -114,17 +120,14 @@ class BodiesOnGround(TreeSystem, TorqueSystem):
         Raises
         ------
         InputError
-            If there is no joint of a name, or a shape does not fit.
+            If there is no joint of this name, a shape does not fit, or a temperature is given without a bath.
         """
         if x is not None:
-            if joints is not None or joint_rates is not None:
+            if degrees or any(value is not None for value in (joints, joint_rates, temperature)):
                 raise InputError("give a state x, or joints and rates by name, not both")
             return super().state(x, batch)
-        q, rates = (
-            self._joint_vector_from_names(joints, "joints"),
-            self._joint_vector_from_names(joint_rates, "joint_rates"),
-        )
-        q, rates = broadcast_batches(q, rates)
+        q = self._joint_vector_from_names(joints, "joints", degrees)
+        q, rates = broadcast_batches(q, self._joint_vector_from_names(joint_rates, "joint_rates", degrees))
         momenta = jnp.einsum("...ij,...j->...i", self.mass_matrix(q), rates)
-        x = jnp.concatenate([q, momenta], axis=-1)
+        x = self._append_entropies(jnp.concatenate([q, momenta], axis=-1), temperature)
         return super().state(x, x.ndim > 1)

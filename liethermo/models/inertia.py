@@ -208,7 +208,11 @@ def checked_inertia_tensors(tensors, allow_rod: bool = False) -> np.ndarray:
     if not np.isfinite(blocks).all():
         raise InputError(f"a tensor of inertia must be finite, got {blocks.tolist()}")
     if not are_symmetric_to_rounding(blocks):
-        raise InputError(f"a tensor of inertia must be symmetric, got {blocks.tolist()}")
+        asymmetry = np.abs(blocks - blocks.swapaxes(-1, -2)).max()
+        raise InputError(
+            f"a tensor of inertia must be symmetric, but it differs from its transpose by {asymmetry:.3g}: "
+            f"{blocks.tolist()}. Use (I + I.T) / 2 if this is an error of measurement"
+        )
     blocks = 0.5 * (blocks + blocks.swapaxes(-1, -2))
     principal = np.linalg.eigvalsh(blocks)
     min_moment = float(principal.min())

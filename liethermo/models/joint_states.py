@@ -18,6 +18,7 @@ from manifolds._pytree_module import Module
 from ..errors import InputError
 from ..functions.energy import Energy, Pullback, Sum
 from ..systems.base import System
+from ..systems.body_states import entropies_of_temperatures
 from ..systems.interface import EngineHints, MotionQuantities
 from ..tracing.programs import jit_unoptimised
 from .articulated_bodies import ArticulatedBodies, JointDamping, JointSprings, KineticEnergy, Motion
@@ -128,8 +129,13 @@ class TreeSystem(System):
         flat_motion = _motions(self.mechanism, x.reshape(-1, self.dim))
         return Motion(*(array.reshape(*x.shape[:-1], *array.shape[1:]) for array in flat_motion))
 
-    def _joint_vector_from_names(self, values: Mapping[str, Any] | None, argument_name: str) -> jax.Array:
-        """Return coordinates or rates of all joints, shape (k,) or (B, k), from values by body name; others are 0."""
+    def _joint_vector_from_names(
+        self, values: Mapping[str, Any] | None, argument_name: str, degrees: bool
+    ) -> jax.Array:
+        """Return coordinates or rates of all joints, shape (k,) or (B, k), from values by body name; others are 0.
+
+        Angles may be given in degrees; the result has radians. Displacements of sliders have one unit only.
+        """
         if not isinstance(values, Mapping | None):
             raise InputError(f"{argument_name} must be a dict by the names of bodies, got {type(values).__name__}")
         values = dict(values or {})
@@ -150,7 +156,17 @@ class TreeSystem(System):
             shape = jnp.broadcast_shapes(*(column.shape[:-1] for column in columns))
         except ValueError:
             raise InputError(f"the entries of {argument_name} have different lengths") from None
-        return jnp.concatenate([jnp.broadcast_to(c, (*shape, c.shape[-1])) for c in columns], axis=-1)
+        vector = jnp.concatenate([jnp.broadcast_to(c, (*shape, c.shape[-1])) for c in columns], axis=-1)
+        return jnp.where(np.array(self.mechanism.slides), vector, jnp.deg2rad(vector)) if degrees else vector
+
+    def _append_entropies(self, x, temperature) -> jax.Array:
+        """Return states of bodies, shape (..., n), with the entropy of the bath at a temperature, if one is given."""
+        if temperature is None:
+            return x
+        if self.baths is None:
+            raise InputError("temperature= needs a bath. Build the system by tree.system(baths=lt.HeatBaths(...))")
+        y = entropies_of_temperatures(self.baths, temperature)
+        return jnp.concatenate([*broadcast_batches(x, y)], axis=-1)
 
 
 def broadcast_batches(*arrays: jax.Array) -> tuple[jax.Array, ...]:

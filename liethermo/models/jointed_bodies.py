@@ -104,9 +104,8 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         if self.orbit is None:
             return replace(laws, name=" + ".join(filter(None, [laws.name, motors])))
         name = " + ".join(filter(None, [laws.name, "gradient of gravity", motors]))
-        return TorqueLaws(
-            name, has_impulse=True, needs_attitude=True, changed_casimirs=frozenset(self.momentum_casimirs())
-        )
+        changed_casimirs = frozenset(self.momentum_casimirs())
+        return TorqueLaws(name, True, not self.has_fixed_attitude, changed_casimirs)
 
     def _torque_at(self, x, t, attitude):
         k = self.mechanism.n_joints
@@ -201,6 +200,8 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         joint_rates: Mapping[str, Any] | None = None,
         centre_of_mass=None,
         velocity=None,
+        temperature=None,
+        degrees: bool = False,
     ) -> jax.Array:
         """Make a state from momenta or velocities and joint coordinates, or check an array of components.
 
@@ -223,6 +224,10 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         centre_of_mass, velocity : array, shape (3,) or (B, 3), optional
             Position (m) and velocity (m/s) of the common centre of mass in axes in space, of a tree in a uniform field
             of gravity; zero by default.
+        temperature : float, or array, shape (B, 1); optional
+            Temperature of the bath; by default that at zero entropy.
+        degrees : bool
+            If true, the angular velocity, joint angles and their rates are in degrees and degrees/s.
 
         Returns
         -------
@@ -231,19 +236,17 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         Raises
         ------
         InputError
-            If there is no joint of a name, or a shape does not fit.
+            If there is no joint of this name, a shape does not fit, or a temperature is given without a bath.
         """
-        velocities = angular_velocity, momentum, joints, joint_rates, centre_of_mass, velocity
+        details = angular_velocity, momentum, joints, joint_rates, centre_of_mass, velocity, temperature
         if x is not None:
-            if any(value is not None for value in velocities):
+            if degrees or any(value is not None for value in details):
                 raise InputError("give a state x, or velocities and joints by name, not both")
             return super().state(x, batch)
         if angular_velocity is not None and momentum is not None:
             raise InputError("give angular_velocity= or momentum=, not both")
-        q, rates = (
-            self._joint_vector_from_names(joints, "joints"),
-            self._joint_vector_from_names(joint_rates, "joint_rates"),
-        )
+        q = self._joint_vector_from_names(joints, "joints", degrees)
+        rates = self._joint_vector_from_names(joint_rates, "joint_rates", degrees)
         name = "angular_velocity" if momentum is None else "momentum"
         given_vectors = [v for v in (angular_velocity, momentum) if v is not None]
         vector = checked_vectors(given_vectors[0] if given_vectors else np.zeros(3), name)
@@ -252,13 +255,13 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         )
         M = self.mass_matrix(q)
         if momentum is None:
-            Omega = vector
+            Omega = jnp.deg2rad(vector) if degrees else vector
         else:
             residual = vector - jnp.einsum("...ij,...j->...i", M[..., :3, 3:], rates)
             Omega = jnp.linalg.solve(M[..., :3, :3], residual[..., None])[..., 0]
         momenta = jnp.einsum("...ij,...j->...i", M, jnp.concatenate([Omega, rates], axis=-1))
         Pi = momenta[..., :3] if momentum is None else vector
-        x = jnp.concatenate([Pi, q, momenta[..., 3:], *translation], axis=-1)
+        x = self._append_entropies(jnp.concatenate([Pi, q, momenta[..., 3:], *translation], axis=-1), temperature)
         return super().state(x, x.ndim > 1)
 
     def _translation_components(self, centre_of_mass, velocity) -> tuple[jax.Array, ...]:

@@ -179,7 +179,7 @@ class BDot(Module):
     ``tau = m × B``, with ``dB/dt = g^T B'(t) - Omega × B`` in body axes [Stickler & Alfriend, J. Spacecraft 13 (1976)
     282]. In a field that is constant in space, ``tau = -k |B|^2`` times the part of Omega normal to B: a torque from
     outside that takes energy from the body. The work of the ledger falls by this energy, and energy less work is
-    constant. The heat is that of the coils and of the source of the field, which are no part of the system.
+    constant. The heat is that of the coils and of the source of the field, which are not part of the system.
 
     Parameters
     ----------

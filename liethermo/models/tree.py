@@ -18,7 +18,7 @@ from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers
 from ..systems import HeatBaths
 from ..tracing.programs import jit_unoptimised
-from ..tracing.short_form import join_shown
+from ..tracing.short_form import join_first_items
 from .articulated_bodies import ArticulatedBodies, JointSprings
 from .bodies_on_ground import BodiesOnGround
 from .inertia import INEQUALITY_RTOL, are_symmetric_to_rounding, satisfies_triangle_inequalities
@@ -176,7 +176,7 @@ class Tree(metaclass=ListedType):
         return next(iter(self._bodies))
 
     def __repr__(self) -> str:
-        return f"Tree({join_shown(self._bodies, ('', ''))})"
+        return f"Tree({join_first_items(self._bodies, ('', ''))})"
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -126,6 +126,9 @@ FAILED_TRAJECTORIES_ROW = "trajectories that failed"
 OUTSIDE_MODEL_VERDICT = "; THE EQUATIONS ARE USED WHERE THEY ARE NOT VALID"
 """End of the verdict of an audit in which a condition of the model does not hold."""
 
+UNPROMISED_NOTE = "no law promised"
+"""Note of the energy or the entropy where the system or the method promises nothing about it."""
+
 LAW_FAILURE_VERDICT = "A LAW FAILS"
 """Verdict of an audit in which a law is violated."""
 
@@ -195,17 +198,18 @@ class Audit(Tabular):
         violated_rows = {row.law for row in self.rows if row.passed is False and not row.concerns_model}
         if violated_rows - {ACCURACY_ROW, CONSISTENCY_ROW, STEPS_TAKEN_ROW, FAILED_TRAJECTORIES_ROW}:
             return LAW_FAILURE_VERDICT
+        laws = "the promised laws" if any(row.note == UNPROMISED_NOTE for row in self.rows) else "the laws"
         if STEPS_TAKEN_ROW in violated_rows:
-            return "THE RUN STOPPED before its end; the laws hold until there"
+            return f"THE RUN STOPPED before its end; {laws} hold until there"
         if FAILED_TRAJECTORIES_ROW in violated_rows:
-            return "SOME TRAJECTORIES STOPPED before their end; the laws hold until there"
+            return f"SOME TRAJECTORIES STOPPED before their end; {laws} hold until there"
         if CONSISTENCY_ROW in violated_rows:
-            return "the laws hold, but THE STEPS DO NOT FOLLOW THE VECTOR FIELD"
+            return f"{laws} hold, but THE STEPS DO NOT FOLLOW THE VECTOR FIELD"
         if self.resolved is None:
-            return "the laws hold"
+            return f"{laws} hold"
         if self.resolved:
-            return f"the laws hold, and the steps resolve the motion{self.coverage and f' ({self.coverage})'}"
-        return "the laws hold, but THE STEPS DO NOT RESOLVE THE MOTION"
+            return f"{laws} hold, and the steps resolve the motion{self.coverage and f' ({self.coverage})'}"
+        return f"{laws} hold, but THE STEPS DO NOT RESOLVE THE MOTION"
 
     def __repr__(self) -> str:
         return f"<Audit of {len(self.rows)} rows: {self.verdict}>"
@@ -493,7 +497,7 @@ def _inexact_law_note(laws: Laws, law: str) -> str:
 
 
 def _why_no_law(laws: Laws, law: str) -> str:
-    return "a law of the mean: it fluctuates on paths" if law in laws.mean else "no law promised"
+    return "a law of the mean: it fluctuates on paths" if law in laws.mean else UNPROMISED_NOTE
 
 
 def _value_or(value: float | None, default: float) -> float:

@@ -357,7 +357,7 @@ class Ensemble(AuditableResult):
         Raises
         ------
         InputError
-            If there is no variable of a name.
+            If there is no variable of this name.
         """
         has_time_series = self.energy.ndim == 2
         series_dims = ("trajectory", "time") if has_time_series else ("trajectory",)

@@ -16,7 +16,7 @@ from ..units import parse_unit, split_label
 from .audit_evidence import AuditableResult
 from .ensemble import Ensemble
 from .netcdf import ENSEMBLE_FORMAT, read_dataset
-from .orientation import angular_velocity, quaternions
+from .orientation import angular_velocity, euler_angles, quaternions
 from .solution import Solution
 
 QUATERNION_COLUMNS = ("q_x", "q_y", "q_z", "q_w")
@@ -57,11 +57,13 @@ def write_csv(
     solution: AuditableResult,
     degrees: bool = False,
     scalar: Literal["last", "first"] = "last",
+    euler: str | None = None,
 ) -> Path:
     """Write the attitudes and angular velocities of a run as a CSV file, which :func:`read_csv` reads back.
 
     The first line names the columns: ``t [s]``, ``q_x, q_y, q_z, q_w`` of the unit quaternions from body to space, and
-    ``omega_x [rad/s]`` and so on in body axes. Numbers are written so that they are read back to the bit.
+    ``omega_x [rad/s]`` and so on in body axes. With ``euler="ZYX"`` the last columns are the Euler angles
+    ``euler_ZYX_1 [rad]`` to ``euler_ZYX_3 [rad]``. Numbers are written so that they are read back to the bit.
 
     Parameters
     ----------
@@ -70,9 +72,11 @@ def write_csv(
     solution : Solution
         A result of a body with attitudes in SO(3), with the second as its unit of time.
     degrees : bool
-        If true, angular velocities are in deg/s.
+        If true, angular velocities are in deg/s, and Euler angles in degrees.
     scalar : {"last", "first"}
         Place of the column ``q_w``.
+    euler : str, optional
+        Sequence of Euler angles that are written too, as for :func:`euler_angles`. :func:`read_csv` does not need them.
 
     Returns
     -------
@@ -81,7 +85,7 @@ def write_csv(
     Raises
     ------
     InputError
-        If the result has no attitudes, or is an ensemble.
+        If the result has no attitudes or is an ensemble, or the sequence is not of three letters.
     FileError
         If the file cannot be written.
     """
@@ -94,6 +98,9 @@ def write_csv(
         unit = "deg/s" if degrees else "rad/s"
         names += [f"{name} [{unit}]" for name in RATE_COLUMNS]
         columns.append(angular_velocity(solution, degrees=degrees))
+    if euler is not None:
+        columns.append(euler_angles(solution, euler, degrees))
+        names += [f"euler_{euler}_{i} [{'deg' if degrees else 'rad'}]" for i in (1, 2, 3)]
     path = Path(path)
     try:
         with path.open("w", newline="", encoding="utf-8") as file:
@@ -124,7 +131,7 @@ def read_csv(path: str | os.PathLike) -> AttitudeHistory:
     Raises
     ------
     FileError
-        If the file cannot be read, a column is missing, or its numbers are no attitudes.
+        If the file cannot be read, a column is missing, or its numbers are not attitudes.
     """
     path = Path(path)
     try:

@@ -390,7 +390,7 @@ def orientation_series(solution: AuditableResult) -> dict[str, np.ndarray]:
 
 def _attitudes(solution: AuditableResult) -> np.ndarray:
     if not isinstance(solution, AuditableResult):
-        raise InputError(f"attitudes are those of a solution or an ensemble, got {solution!r:.60}")
+        raise InputError(f"attitudes need a solution or an ensemble, got {solution!r:.60}")
     if solution.attitude is None:
         raise InputError(
             "there are no attitudes. Give the system a group, such as group=mf.SO(3), or a model of a body "

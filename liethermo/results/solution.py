@@ -322,7 +322,7 @@ class Solution(AuditableResult):
         Raises
         ------
         InputError
-            If there is no variable of a name.
+            If there is no variable of this name.
         """
         series = {"energy": ("time", self.energy)}
         if self.entropy is not None:

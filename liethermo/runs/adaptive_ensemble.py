@@ -177,7 +177,7 @@ class _BatchRecorder:
     def record_pauses(self) -> None:
         handler, runs = self.pause_handler, self.runs
         if self.run.events is not None:
-            self.run.events.raise_error()
+            self.run.events.raise_first_error()
             self.record.store_events(handler.occurrences, self.members)
             handler.occurrences.clear()
         indices = handler.paused_indices(StatusCode.PAUSED_AT_STOP)

@@ -159,7 +159,7 @@ class AdaptiveRun:
 
     def record_pauses(self) -> None:
         if self.event_set is not None:
-            self.event_set.raise_error()
+            self.event_set.raise_first_error()
 
     def record_ended_trajectories(self) -> None:
         """Record the time of the event that ended the run, and the event functions that are undefined at its end."""

@@ -30,7 +30,6 @@ from .preparation import (
     check_choice,
     check_steps,
     checked_or_default_method,
-    initial_state,
     limit_family_to_span,
     limit_to_span,
     refuse_tracers,
@@ -214,7 +213,7 @@ class _EnsembleOptions(NamedTuple):
         tolerance = step.tolerance if isinstance(step, Adaptive) else None
         problem = Problem.from_user(family.member(0), self.method, noise, tolerance, states)
         method, family = problem.method, wrap_family(family, problem.system)
-        states = np.asarray(initial_state(problem.system, states, schedule.start, attitude, batch=True))
+        states = np.asarray(problem.system.initial_state(states, schedule.start, attitude, batch=True))
         family_in_span = limit_family_to_span(family, problem.system, schedule)
         member = problem.system_in_span(schedule)
         reasons = {

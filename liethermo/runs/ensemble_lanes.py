@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 
 import numpy as np
 
+from ..disk import available_cores
 from ..engines import array_engine
 from ..engines.compiled.engine import CompiledBatch
 from ..engines.compiled.parameters import flat_parameters
@@ -107,7 +108,7 @@ MAX_THREADS: contextvars.ContextVar[int | None] = contextvars.ContextVar("THREAD
 
 def _available_cores() -> int:
     """Return the number of cores that this process may use."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = available_cores()
     return min(cores, MAX_THREADS.get() or cores)
 
 

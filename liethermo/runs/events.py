@@ -18,8 +18,9 @@ from manifolds._pytree_module import Module
 from ..engines.adaptive_runs import EventOccurrence, EventRules
 from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..results.events import Events, EventSeries
-from ..systems import AttitudeSystem, DrivenSystem, EmbeddedSystem, System
-from ..tracing.numpy_calls import PythonCall, with_jax_arrays
+from ..systems import System
+from ..systems.kinds import user_system
+from ..tracing.numpy_calls import PythonCall, accept_jax_arrays
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import trace_callables
 
@@ -100,11 +101,11 @@ class EventSet:
         """True if a function cannot be traced and is called in Python."""
         return any(function.calls_python for function in self.functions)
 
-    def raise_error(self) -> None:
+    def raise_first_error(self) -> None:
         """Raise the exception of an event function that is called in Python, if there was one."""
         for function in self.functions:
             if isinstance(function, EventFunction) and isinstance(function.function, PythonCall):
-                function.function.raise_error()
+                function.function.raise_first_error()
 
 
 class EventSpecification:
@@ -138,15 +139,25 @@ def _prepared_event(
     if not callable(event):
         raise InputError(f"until must be lt.Relaxed(tol) or a function of the state, got {event!r}")
     name = "the event function" if len(specification.events) == 1 else f"event function {number}"
-    direction = int(np.sign(getattr(event, "direction", 0) or 0))
+    direction = int(np.sign(event_direction(event)))
     count = _terminal_count(event, is_terminal=scipy_arguments is None)
     function = _checked_event_function(event, name, scipy_arguments, system, t, x)
     return name, function, direction, None if count is None else count - counted, scipy_arguments is not None
 
 
+def event_direction(event: Any) -> float:
+    """Return the ``direction`` of an event function, as SciPy reads it; 0 if it has none."""
+    return getattr(event, "direction", 0) or 0
+
+
+def event_terminal(event: Any, default: bool = False) -> Any:
+    """Return the attribute ``terminal`` of an event function, as SciPy reads it; ``default`` if it has none."""
+    return getattr(event, "terminal", default)
+
+
 def _terminal_count(function: Any, is_terminal: bool) -> int | None:
     """Return the number of zeros of a function after which the run ends; None if it never ends the run."""
-    terminal = getattr(function, "terminal", is_terminal)
+    terminal = event_terminal(function, is_terminal)
     if terminal is None or terminal is False or terminal == 0:
         return None
     if int(terminal) != terminal or terminal < 0:
@@ -212,18 +223,11 @@ def _event_argument(name: str, system: System, t, x):
     if name == "t":
         return jnp.asarray(t, dtype=jnp.float64)
     if name == "attitude":
-        assert isinstance(system, AttitudeSystem)
-        return system.split_state(x)[1]
+        assert system.attitude_layout is not None
+        return system.attitude_layout.split(x)[1]
     if name in ("parameters", "system"):
         return jnp.concatenate([jnp.ravel(a) for a in _parameter_arrays(system)] or [jnp.zeros(0)])
     return system.user_state(x)
-
-
-def user_system(system: System) -> System:
-    """Return the user's system, without clock, attitude and embedding."""
-    if isinstance(system, EmbeddedSystem):
-        return user_system(system.manifold)
-    return user_system(system.body) if isinstance(system, AttitudeSystem | DrivenSystem) else system
 
 
 def _parameter_arrays(system: System) -> list:
@@ -241,14 +245,14 @@ def _checked_event_function(
         If the function fails at the initial state, or returns no number.
     """
     names = ("t", "x") if scipy_arguments is not None else _argument_names(function)
-    if "attitude" in names and not isinstance(system, AttitudeSystem):
+    if "attitude" in names and system.attitude_layout is None:
         raise InputError(f"{name} asks for the attitude, and this system has none. Give it a group")
     call = _with_user_arguments(function, names, scipy_arguments or (), system)
     example = jax.eval_shape(lambda t, x: event_arguments(names, system, t, x), jnp.zeros(()), x)
     shapes = [argument.shape for argument in example]
     state_shape = jax.eval_shape(system.user_state, jax.ShapeDtypeStruct((system.dim,), jnp.float64)).shape
     failure: Exception | None = None
-    for traceable in (call, with_jax_arrays(call)):
+    for traceable in (call, accept_jax_arrays(call)):
         try:
             traced = trace_callables(traceable, lambda f, *a: f(*a), *shapes)
             value = jax.eval_shape(traced, *example)
@@ -295,8 +299,8 @@ def _argument_names(function: Callable) -> tuple[str, ...]:
     names = tuple(name if name in ARGUMENT_NAMES else "x" for name in required) or ("x",)
     if names.count("x") > 1:
         raise InputError(
-            f"an event function has the arguments (x) or (t, x), and any of {', '.join(ARGUMENT_NAMES)} by these "
-            f"names; got {', '.join(required)}"
+            f"an event function must have the arguments (x) or (t, x), and any of {', '.join(ARGUMENT_NAMES)} by "
+            f"these names, got {', '.join(required)}"
         )
     return names
 

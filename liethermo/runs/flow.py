@@ -34,6 +34,7 @@ from ..functions.time_span import DeclaredTimes
 from ..integrators import OneStepMethod
 from ..systems import System
 from ..systems.clock import system_of_step
+from ..systems.kinds import require_system
 from ..tracing.programs import jit_cached, jit_unoptimised
 from .adaptive import Adaptive
 from .flow_derivatives import implicit_solution, state_derivatives
@@ -41,7 +42,6 @@ from .named_parameters import replace_parameters
 from .preparation import (
     checked_initial_state,
     checked_or_default_method,
-    initial_state,
     limit_to_span,
     prepare_for_method,
 )
@@ -211,7 +211,7 @@ def flow(
     initial_arguments = x, schedule.start, attitude
     # the values of a traced state are unknown, so it cannot be checked
     x = jnp.asarray(
-        initial_state(system, *initial_arguments)
+        system.initial_state(*initial_arguments)
         if is_traced(system, x)
         else checked_initial_state(system, method, *initial_arguments)
     )
@@ -272,8 +272,7 @@ def _states_at_times(system, method, path, grid, times, span: tuple[float, float
 
 def _check_arguments(system, t_span, step) -> None:
     """Raise InputError if the arguments do not belong to a run with fixed steps."""
-    if not isinstance(system, System):
-        raise InputError(f"flow needs a system such as lt.models.rigid_body(), got {type(system).__name__}")
+    require_system(system, "flow needs a system such as lt.models.rigid_body()")
     if isinstance(step, Adaptive):
         raise InputError("flow needs a fixed step, a number, got lt.Adaptive. For adaptive steps use lt.integrate")
     if is_traced(t_span, step):

@@ -93,8 +93,8 @@ def integrate(
         Write the solution to this file, at most once a minute during the run, at its end, and on failure.
     attitude : array, shape (m, m), or scipy.spatial.transform.Rotation; optional
         If the system has a group, the initial element of it (dimensionless); the identity by default. For SO(3) it is
-        the matrix from body axes to axes in space; :func:`liethermo.bodies.attitude` makes one of a quaternion or of
-        Euler angles.
+        the matrix from body axes to axes in space; :func:`liethermo.bodies.attitude` converts a quaternion or Euler
+        angles.
     noise : Fluctuations, optional
         ``lt.Fluctuations(boltzmann, seed)``, the noise that belongs to the dissipation. The method is then
         ``MetriplecticMidpoint``, which is the default, with steps of one size.

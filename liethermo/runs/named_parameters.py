@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import DictKey, GetAttrKey, SequenceKey
 
 from manifolds._arrays import host_array, real_array
 
+from ..dissipation.base import Dissipation
+from ..dissipation.checks import NEGATIVE_RATE_MESSAGE
 from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
 from ..errors import InputError
+from ..functions.bath_energy import BathEnergy
+from ..functions.conditions import refusal_message, require_condition
 from ..functions.energy import Quadratic
 from ..models.inertia import inverse_moments
 from ..systems import System
@@ -71,11 +76,13 @@ def replace_parameters(system: System, values: Mapping[str, Any]) -> System:
     Raises
     ------
     InputError
-        If the system has no parameter of a name, or a value has another shape.
+        If the system has no parameter of this name, or a value has another shape or is refused by the constructor of
+        its object, as a negative rate is.
     """
     # the system's own arrays, which cannot change in place, so that results for the new system can be cached
     leaves: list[Any] = jax.tree_util.tree_leaves(eqx.filter(system, eqx.is_inexact_array))
     replaced: dict[int, str] = {}
+    conditions = conditions_by_leaf(system)
     for name, value in values.items():
         parameter = find_parameter(system, name)
         array = host_array(real_array(value))
@@ -84,7 +91,81 @@ def replace_parameters(system: System, values: Mapping[str, Any]) -> System:
         _note_given_name(replaced, name, parameter)
         for i in parameter.leaves:
             leaves[i] = real_array(parameter.to_leaf(array))
+            if i in conditions:
+                require_condition(leaves[i], conditions[i].test, conditions[i].template)
     return ProgramStructure.from_module(system).rebuild(leaves)
+
+
+class ParameterCondition(NamedTuple):
+    """What the constructor of an object requires of the values of one of its fields, and new values have to meet.
+
+    Attributes
+    ----------
+    owner : type
+    field : str
+    test : function from an array to an array of truth values
+    template : str
+        The message of the error, with a placeholder ``{value}``.
+    """
+
+    owner: type
+    field: str
+    test: Callable
+    template: str
+
+
+PARAMETER_CONDITIONS = (
+    ParameterCondition(Dissipation, "rate", lambda value: value >= 0.0, NEGATIVE_RATE_MESSAGE),
+    ParameterCondition(
+        BathEnergy, "capacity", lambda value: value > 0.0, "the capacity of a bath must be positive, got {value}"
+    ),
+    ParameterCondition(
+        BathEnergy, "temperature", lambda value: value > 0.0, "the temperature of a bath must be positive, got {value}"
+    ),
+)
+
+
+def conditions_by_leaf(system: System) -> dict[int, ParameterCondition]:
+    """Return the conditions on the arrays of a system, by the number of the array."""
+    conditions = {}
+    leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_inexact_array))
+    for i, (path, _) in enumerate(leaves):
+        for condition in PARAMETER_CONDITIONS:
+            is_field = bool(path) and path[-1] == GetAttrKey(condition.field)
+            if is_field and isinstance(_node_at(system, path[:-1]), condition.owner):
+                conditions[i] = condition
+    return conditions
+
+
+def refused_members(system: System, arrays: Sequence[np.ndarray]) -> dict[int, str]:
+    """Return the members of a family with a value that the constructor of its object refuses, with the reasons.
+
+    Members with NaN are left out: the family has a reason for them.
+
+    Parameters
+    ----------
+    system : System
+    arrays : list of array
+        As :func:`arrays_with_members` returns them.
+    """
+    reasons = {}
+    for i, condition in conditions_by_leaf(system).items():
+        is_refused = ~np.asarray(condition.test(arrays[i])) & ~np.isnan(arrays[i])
+        for member in np.flatnonzero(is_refused.reshape(len(arrays[i]), -1).any(axis=1)):
+            reasons[int(member)] = refusal_message(condition.template, arrays[i][member])
+    return reasons
+
+
+def _node_at(tree: Any, path: Sequence[Any]) -> Any:
+    """Return the node of a pytree at a path of fields, indices and keys; None if the path has keys of another kind."""
+    for key in path:
+        if isinstance(key, GetAttrKey):
+            tree = getattr(tree, key.name)
+        elif isinstance(key, SequenceKey | DictKey):
+            tree = tree[key.idx if isinstance(key, SequenceKey) else key.key]
+        else:
+            return None
+    return tree
 
 
 def arrays_with_members(system: System, values: Mapping[str, Any]) -> list[np.ndarray]:
@@ -95,7 +176,7 @@ def arrays_with_members(system: System, values: Mapping[str, Any]) -> list[np.nd
     Raises
     ------
     InputError
-        If the system has no parameter of a name, or values have another shape.
+        If the system has no parameter of this name, or values have another shape.
     """
     leaves = [array[None] for array in parameter_arrays(system)]
     replaced: dict[int, str] = {}

@@ -23,6 +23,7 @@ from ..integrators.fluctuating import stochastic_method
 from ..systems import System
 from ..systems.check import AXIOM_TOLERANCE, CheckReport, CheckRow
 from ..tracing.interpret import evaluate_at_points
+from ..tracing.short_form import callable_name
 from .schedule import StepSchedule
 
 ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
@@ -213,7 +214,7 @@ class Fluctuations(metaclass=ListedType):
 
     def to_provenance(self) -> dict[str, Any]:
         """Return the noise as data for the provenance of a run."""
-        density = None if self.density is None else getattr(self.density, "__name__", str(self.density))
+        density = None if self.density is None else callable_name(self.density, str(self.density))
         return {**vars(self), "seed": self.seeds if len(self.seeds) > 1 else self.seeds[0], "density": density}
 
     def method_with_noise(self, system: System, method: OneStepMethod) -> OneStepMethod:

@@ -21,13 +21,11 @@ from ..results.status import Laws
 from ..systems import (
     AttitudeSystem,
     DrivenSystem,
-    EmbeddedSystem,
     LiePoissonSystem,
     System,
     embed_in_arrays,
     make_autonomous,
 )
-from ..systems.attitude import driven_system_or_none
 from ..systems.clock import WORK_NAME
 from ..systems.invariants import recorded_functions_with_verdicts, resolve_invariants_near, undecided_functions
 from ..systems.transport import has_generator
@@ -40,13 +38,6 @@ from .schedule import StepSchedule
 from .system_family import Family
 
 Result = TypeVar("Result")
-
-MISSING_GROUP_MESSAGE = (
-    "an attitude is for a system with a group. Give LiePoissonSystem one, such as group=mf.SO(3), or a model of a body "
-    "attitude=True"
-)
-"""Error message for an attitude of a system without a group."""
-
 
 REFERENCE_STEPS = (
     "Reference chooses its own steps and cannot be combined with Adaptive, save_at, until or dense. Use another method"
@@ -87,7 +78,8 @@ def checked_or_default_method(method, noise: Fluctuations | None = None, *, runs
     Raises
     ------
     InputError
-        If it is no method, or the run is not one of a single trajectory (``runs_alone``) and the method is Reference.
+        If it is not a method, or the method is Reference and the run is not one of a single trajectory
+        (``runs_alone``).
     """
     if method is None:
         return DEFAULT_METHOD if noise is None else DEFAULT_NOISE_METHOD
@@ -157,21 +149,6 @@ def prepare_for_method(
     return AttitudeSystem(autonomous_system, kind), WithAttitude(method, kind)
 
 
-def initial_state(system: System, x0, t: float, attitude=None, batch: bool = False) -> jax.Array | np.ndarray:
-    """Return the initial state of a prepared system from the user's x0; with ``batch``, from a batch of them.
-
-    Raises
-    ------
-    InputError
-        If ``attitude`` is given and the system has no group.
-    """
-    if isinstance(system, AttitudeSystem):
-        return system.initial_state(x0, attitude, batch, t)
-    if attitude is not None:
-        raise InputError(MISSING_GROUP_MESSAGE)
-    return system.initial_state(x0, t, batch) if isinstance(system, DrivenSystem) else system.state_array(x0, batch)
-
-
 def checked_initial_state(system: System, method, x0, t: float, attitude=None) -> jax.Array | np.ndarray:
     """Return the initial state of a prepared system from the user's x0, after checking that a run can start there.
 
@@ -180,7 +157,7 @@ def checked_initial_state(system: System, method, x0, t: float, attitude=None) -
     InputError
         If ``attitude`` is given and the system has no group, or no run can start at x0.
     """
-    x = initial_state(system, x0, t, attitude)
+    x = system.initial_state(x0, t, attitude)
     if reason := why_not_startable(system, method, x):
         raise InputError(reason)
     return x
@@ -196,11 +173,11 @@ def why_not_startable(system: System, method, x) -> str:
 
 def wrap_family(family: Family, system: System) -> Family:
     """Return the family with each member wrapped as ``system`` wraps one of them."""
-    if isinstance(system, AttitudeSystem):
-        return wrap_family(family, system.body).map_members(AttitudeSystem, system.reconstruction)
-    if isinstance(system, EmbeddedSystem):
-        return family.map_members(EmbeddedSystem, *system.projection_flags)
-    return wrap_family(family, system.body).map_members(DrivenSystem) if isinstance(system, DrivenSystem) else family
+    if system.wrapped_system is None:
+        return family
+    return wrap_family(family, system.wrapped_system.system).map_members(
+        system.wrapped_system.wrap, *system.wrapped_system.arguments
+    )
 
 
 MAX_LIMITED_SYSTEMS = 64
@@ -216,7 +193,7 @@ def limit_to_span(system: System, schedule: StepSchedule) -> System:
     results are shared.
     """
     span = *schedule.function_span, *schedule.breaks
-    if not is_driven_run(system):
+    if system.clock is None:
         return system
     if is_traced(system):
         return set_time_span(system, *span)
@@ -228,12 +205,7 @@ def limit_to_span(system: System, schedule: StepSchedule) -> System:
 def limit_family_to_span(family: Family, system: System, schedule: StepSchedule) -> Family:
     """Return the family with each member limited to the span of a schedule; ``system`` is one of the members."""
     span = *schedule.function_span, *schedule.breaks
-    return family.map_members_with_shared_numbers(set_time_span, *span) if is_driven_run(system) else family
-
-
-def is_driven_run(system: System) -> bool:
-    """Return True if a prepared system has a clock, because its functions depend on time."""
-    return driven_system_or_none(system) is not None
+    return family.map_members_with_shared_numbers(set_time_span, *span) if system.clock is not None else family
 
 
 @memoize

@@ -11,13 +11,12 @@ import numpy as np
 
 from ..engines.select_engine import MIN_STEPS_TO_COMPILE, EngineWithFallback
 from ..integrators import OneStepMethod, Reference
-from ..systems import AttitudeSystem, System
+from ..systems import System
 from ..tracing.caching import memoize
 from .noise import Fluctuations
 from .preparation import (
     checked_initial_state,
     invariants_and_laws,
-    is_driven_run,
     limit_to_span,
     prepare_system_and_method,
     resolve_invariants,
@@ -52,17 +51,12 @@ class Problem:
         self.system, self.method, self.noise = system, method, noise
         invariants, self.laws = invariants_and_laws(system, method)
         self.functions = RecordedFunctions.from_system(system, invariants)
-        self.is_driven = is_driven_run(system)
+        self.is_driven = system.clock is not None
         self._engines = _ThreadEngines()
         self.state_shape = system.shape if system.sites else (system.dim,)
         kind = type(system)
         self.has_fixed_domain = system.space is None and system.domain.allows_every_start
-        self.starts_anywhere = (
-            self.has_fixed_domain
-            and not self.is_driven
-            and kind.state_array is System.state_array
-            and not isinstance(system, AttitudeSystem)
-        )
+        self.starts_anywhere = self.has_fixed_domain and system.inner is None and kind.state_array is System.state_array
 
     @classmethod
     def from_user(

@@ -20,7 +20,8 @@ from ..functions.time_span import TIMES_OF_SMOOTH_FUNCTIONS, DeclaredTimes
 from ..integrators import OneStepMethod, Reference
 from ..results.ensemble import Ensemble
 from ..results.solution import Solution
-from ..systems import AttitudeSystem, System
+from ..systems import System
+from ..systems.kinds import require_system
 from ..tracing.caching import LRUCache
 from ..tracing.scalarize import UnsupportedPrimitive
 from .adaptive import Adaptive
@@ -105,10 +106,7 @@ class Propagator(metaclass=ListedType):
         if noise is not None:
             check_noise(noise)
         method = checked_or_default_method(method, noise, runs_alone=True)
-        if not isinstance(system, System):
-            raise InputError(
-                f"the first argument must be a system such as lt.LiePoissonSystem, got {type(system).__name__}"
-            )
+        require_system(system, "the first argument must be a system such as lt.LiePoissonSystem")
         check_choice("engine", engine, ENGINES)
         check_steps(method, step, noise)
         self.system, self.method, self.step, self.engine, self.noise = system, method, step, engine, noise
@@ -264,7 +262,8 @@ class Propagator(metaclass=ListedType):
         Raises
         ------
         InputError
-            If the system has no parameter of a name, or a value has another shape.
+            If the system has no parameter of this name, or a value has another shape or is refused by the constructor
+            of its object, as a negative rate is.
         """
         values = {name: np.asarray(value, dtype=np.float64) for name, value in parameters.items()}
         key = tuple((name, value.shape, value.tobytes()) for name, value in sorted(values.items()))
@@ -389,7 +388,7 @@ class Propagator(metaclass=ListedType):
         if has_undecided_invariants(self.system):  # what is conserved may depend on the initial state
             return None
         problem = self._problem()
-        return None if problem.is_driven or isinstance(problem.system, AttitudeSystem) else problem
+        return problem if problem.system.inner is None else None
 
 
 def _leave_to_run(x0) -> None:

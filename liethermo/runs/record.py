@@ -37,8 +37,7 @@ from ..results.rounding_scale import InvariantDrift, RoundingScale
 from ..results.solution import Solution
 from ..results.status import Laws
 from ..results.step_sampling import MAX_SAMPLED_VALUES, REPLAY_COST_RATIO, StepSample
-from ..systems import AttitudeSystem, System
-from ..systems.attitude import driven_system_or_none
+from ..systems import System
 from ..systems.conditions import RunCondition, worst_conditions
 from ..systems.states import reshape_to_sites
 from ..tracing.interpret import evaluate_at_points
@@ -144,8 +143,8 @@ class EnsembleRecord:
         self.trajectories = (
             np.full((n_trajectories, len(self.saved_times), dim + 2), np.nan) if outputs == "trajectory" else None
         )
-        self.driven = driven_system_or_none(self.member)
-        self.work = None if self.driven is None else np.full(n_trajectories, np.nan)
+        self.clock = self.member.clock
+        self.work = None if self.clock is None else np.full(n_trajectories, np.nan)
         self.x0 = first_group.x0
         if len(self.x0) < n_trajectories:
             self.x0 = np.full((n_trajectories, dim), np.nan)
@@ -181,13 +180,13 @@ class EnsembleRecord:
                 self.saved_times,
             )
         x0, attitude, attitude0, work = self.x0, None, None, self.work
-        if isinstance(self.member, AttitudeSystem):
-            x0, attitude0 = map(np.asarray, self.member.split_state(x0))
+        if (layout := self.member.attitude_layout) is not None:
+            x0, attitude0 = map(np.asarray, layout.split(x0))
             if x is not None:
-                x, attitude = map(np.asarray, self.member.split_state(x))
-        if self.driven is not None:
+                x, attitude = map(np.asarray, layout.split(x))
+        if self.clock is not None:
             if self.trajectories is not None:
-                work = np.asarray(self.driven.work(x))
+                work = np.asarray(self.clock.work(x))
             x, x0, energy = None if x is None else x[..., :-2], x0[..., :-2], energy + work
         engine, events = " and ".join(sorted({group.engine for group in self.groups} - {""})), self.groups[0].events
         result = Ensemble(
@@ -370,8 +369,8 @@ class GroupRecord:
         self._explain_failures(members, final["x"], status, end_time)
         if record.x is not None:
             record.x[rows] = final["x"]
-        if record.driven is not None and record.work is not None:
-            record.work[rows] = record.driven.work(final["x"][..., : record.driven.dim])
+        if record.clock is not None and record.work is not None:
+            record.work[rows] = record.clock.work(final["x"])
 
     def _explain_failures(
         self, members: MemberSelection, x: np.ndarray, status: np.ndarray, end_time: np.ndarray

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.integrate
@@ -18,8 +19,10 @@ from ..integrators import OneStepMethod
 from ..results.solution import Solution
 from ..systems import System
 from ..systems.invariants import stack_gradients
+from ..systems.kinds import require_system
 from ..systems.linearisation import conserved_functions, counter_components
 from ..tracing.interpret import evaluate_at_points
+from ..tracing.programs import jit_unoptimised
 from .propagator import Propagator
 from .schedule import CHUNK_STEPS
 
@@ -159,8 +162,7 @@ def steady_cycle(
     >>> cycle.work < 0.0, round(cycle.efficiency, 12), 1 - 1.0 / 2.0
     (True, 0.5, 0.5)
     """
-    if not isinstance(system, System):
-        raise InputError(f"system must be a system such as lt.models.rigid_body(), got {type(system).__name__}")
+    require_system(system, "system must be a system such as lt.models.rigid_body()")
     if not system.is_driven:
         raise InputError(f"this {system.kind} does not depend on time. Its state at rest is lt.steady_state(system)")
     if not (isinstance(period, int | float | np.number) and np.isfinite(period) and period > 0.0):
@@ -228,13 +230,23 @@ def _check_periodicity(system: System, period: float, start: float) -> None:
     """Raise InputError unless the vector field repeats itself after a period, at a few states and times."""
     points = jnp.asarray(system.samples(3))
     times = start + period * np.array(CHECKED_FRACTIONS)
-    fields = [np.stack([np.asarray(system.vector_field(points, t + shift)) for t in times]) for shift in (0.0, period)]
+    fields = np.asarray(_vector_fields(system, points, jnp.asarray([times, times + period])))
     difference, size = np.abs(fields[1] - fields[0]).max(), np.abs(fields[0]).max()
     if not difference <= PERIODICITY_RTOL * max(size, np.finfo(float).tiny) * max(1.0, abs(start) + period):
         raise InputError(
             f"this {system.kind} does not repeat itself after the period {period:g}: its vector field then differs by "
             f"{difference / size:.2g} of its size. Functions of time have to be periodic for all times"
         )
+
+
+@jit_unoptimised
+def _vector_fields(system: System, points, times) -> jax.Array:
+    """Return the vector field at all times and points, shape ``(*times, points, n)``, in one program.
+
+    Evaluated one operation after another, the field of a drive with baths takes much longer than the run.
+    """
+    shape = (*times.shape, *points.shape)
+    return system.vector_field(jnp.broadcast_to(points, shape), jnp.broadcast_to(times[..., None], shape[:-1]))
 
 
 class _PeriodMap(NamedTuple):

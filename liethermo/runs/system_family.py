@@ -18,10 +18,11 @@ from ..errors import InputError, LiethermoError
 from ..models.inertia import are_inertia_tensors
 from ..results.audit_evidence import energy_and_entropy, rounding_scales
 from ..systems import System
+from ..systems.kinds import require_system
 from ..tracing.caching import fingerprint
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.traced import TracedFunction, trace_function
-from .named_parameters import arrays_with_members, find_parameter
+from .named_parameters import arrays_with_members, find_parameter, refused_members
 
 MAX_CHECKED_MEMBERS = 8
 """Largest number of members that are built and checked one by one at a time."""
@@ -105,7 +106,10 @@ class Family:
                     "are expected. Give the moments of each trajectory as a row, or a system with a tensor"
                 )
         arrays = arrays_with_members(system, parameters)
-        return cls(ProgramStructure.from_module(system), arrays, None if parameters else system)
+        reasons = refused_members(system, arrays)
+        return cls(
+            ProgramStructure.from_module(system), arrays, None if parameters else system, refusal_reasons=reasons
+        )
 
     @classmethod
     def from_function(cls, build: Callable, parameters) -> Family:
@@ -117,9 +121,7 @@ class Family:
 
         def rebuild(arrays):
             system = build(jax.tree_util.tree_unflatten(structure, arrays))
-            if not isinstance(system, System):
-                raise InputError(f"the function must return a system, got {type(system).__name__}")
-            return system
+            return require_system(system, "the function must return a system")
 
         shapes = tuple(value.shape[1:] for value in values)
         return cls(ProgramStructure((build, structure), shapes, rebuild), values, n_builder_arrays=len(values))

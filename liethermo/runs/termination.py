@@ -76,7 +76,10 @@ def higher_order_advice(method: OneStepMethod, step: Adaptive) -> str:
     if method.order >= SUFFICIENT_ORDER:
         return ""
     better = "lt.MetriplecticRungeKutta(8)" if method.explicit else "lt.MetriplecticGauss(4)"
-    return f". {method} has order {method.order}; {better}, of order 8, takes far fewer at rtol={step.rtol:g}"
+    return (
+        f"{method} has order {method.order}, too low for rtol={step.rtol:g}. Use {better}, of order 8, which takes far "
+        "fewer steps. Otherwise "
+    )
 
 
 def adaptive_failure_status(
@@ -92,8 +95,11 @@ def adaptive_failure_status(
         code = StatusCode.STEP_LIMIT if outcome.exhausted_limit else StatusCode.STEP_UNDERFLOW
         return Status(code, f"after {steps} steps {text}", steps, t, residual)
     if outcome.exhausted_limit == "steps":
-        text = f"{step.most_steps} steps were tried and t = {t:g} of {end:g} is reached: Adaptive(most_steps=...) "
-        text += f"allows more, and a larger tolerance takes fewer{higher_order_advice(method, step)}"
+        text = f"{step.most_steps} steps were tried and t = {t:g} of {end:g} is reached. "
+        text += (
+            f"{higher_order_advice(method, step)}Adaptive(rtol, most_steps=...) allows more steps, and a larger rtol "
+        )
+        text += "takes fewer"
         return Status(StatusCode.STEP_LIMIT, text, steps, t, residual)
     if outcome.exhausted_limit:
         text = f"the saved values of {steps} steps fill the memory and t = {t:g} of {end:g} is reached: "

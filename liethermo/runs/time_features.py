@@ -12,7 +12,6 @@ import numpy as np
 from manifolds.errors import warn
 
 from ..systems import System
-from ..systems.attitude import driven_system_or_none
 from ..tracing.interpret import evaluate_at_points
 from .adaptive import Adaptive
 from .schedule import StepSchedule
@@ -129,10 +128,9 @@ def undeclared_features(system: System, x: np.ndarray, schedule: StepSchedule) -
 
 def _gradient_and_torque_of_state_at_times(system: System, x: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Return the gradient of the energy and the torque at a state at several times, shape (times, values)."""
-    driven = driven_system_or_none(system)
-    assert driven is not None
+    assert system.clock is not None
     states = np.tile(np.asarray(x, dtype=np.float64), (len(times), 1))
-    states[:, driven.dim - 2] = times * driven.unit
+    states[:, system.clock.index] = times * system.clock.unit
     return np.asarray(evaluate_at_points(_time_dependent_values, system, states))
 
 

@@ -25,7 +25,7 @@ from ..systems.invariants import (
     random_states,
 )
 from ..tracing.trace_errors import TRACE_ERRORS
-from .named_parameters import find_parameter
+from .named_parameters import conditions_by_leaf, find_parameter
 from .preparation import prepare_system_and_method
 from .problem import Problem
 
@@ -79,6 +79,13 @@ class VariedParameters:
         self.entries = np.concatenate([self._leaves[i].ravel() for i in self._varied_leaves])
         slots = iter(self._split(self.entries))
         self._slots = [(parameter, [next(slots) for _ in parameter.leaves]) for parameter in parameters]
+        conditions = conditions_by_leaf(system)
+        self._conditions = [
+            (conditions[i].test, slot)
+            for parameter, slots_of_leaves in self._slots
+            for i, slot in zip(parameter.leaves, slots_of_leaves, strict=True)
+            if i in conditions
+        ]
         self._functions = tuple(
             name for name in named_functions(system) if name not in invariants_by_construction(system)
         )
@@ -92,7 +99,8 @@ class VariedParameters:
     def program_key(self, values: Iterable[Any]) -> Hashable | None:
         """Set the values of the parameters; return a key of the machine code that they need.
 
-        None if a value has another shape, or if what the system conserves cannot be decided here.
+        None if a value has another shape or is refused by the constructor of its object, or if what the system
+        conserves cannot be decided here.
         """
         for (parameter, slots), value in zip(self._slots, values, strict=True):
             array = np.asarray(value, dtype=np.float64)
@@ -101,6 +109,8 @@ class VariedParameters:
             leaf = parameter.to_leaf(array)
             for slot in slots:
                 slot[...] = leaf
+        if not all(np.all(test(slot)) for test, slot in self._conditions):
+            return None
         if self._test is not None:
             self._codes = self._test().min(axis=0).tolist()
             if not all(code in (0.0, CONSERVED_CODE) for code in self._codes):

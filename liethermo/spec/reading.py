@@ -28,6 +28,7 @@ from ..studies.axes import Zipped, latin_hypercube, sobol, zipped
 from ..studies.measures import At
 from ..studies.study import Study
 from ..systems import System
+from ..tracing.short_form import callable_name
 from .schema import (
     SECTIONS,
     AdaptiveStep,
@@ -82,7 +83,7 @@ def _validation_fault_text(key: str, fault: Mapping[str, Any], schema: type, rea
         hint, allowed_text = did_you_mean_text(fault["loc"][-1], keys), ", ".join(keys) or "none"
         return f"{name}: no such key{hint}; {reader_name} takes {allowed_text}"
     if fault["type"] == "missing":
-        field = getattr(schema, "model_fields", {}).get(fault["loc"][-1])
+        field = _model_fields(schema).get(fault["loc"][-1])
         return f"{name} is missing" + (f": {field.description}" if field else f"; {reader_name} needs it")
     if fault["type"] in ("model_type", "dict_type"):
         return f"{name} = {format_value(fault['input'])}: must be a section [{name}]"
@@ -104,12 +105,15 @@ def _allowed_keys(schema: type, location: tuple) -> list[str]:
     for key_part in location[:-1]:
         if isinstance(key_part, str) and key_part in SCHEMA_BY_TAG:
             schema = SCHEMA_BY_TAG[key_part]
-        elif (field := getattr(schema, "model_fields", {}).get(key_part)) is not None:
-            nested_models = [
-                kind for kind in (field.annotation, *get_args(field.annotation)) if hasattr(kind, "model_fields")
-            ]
+        elif (field := _model_fields(schema).get(key_part)) is not None:
+            nested_models = [kind for kind in (field.annotation, *get_args(field.annotation)) if _model_fields(kind)]
             schema = nested_models[0] if nested_models else schema
-    return list(getattr(schema, "model_fields", None) or schema.__annotations__)
+    return list(_model_fields(schema) or schema.__annotations__)
+
+
+def _model_fields(schema: Any) -> dict[str, Any]:
+    """Return the fields of a model of pydantic; {} for a typed dictionary or any other type."""
+    return getattr(schema, "model_fields", {})
 
 
 def validate_function_arguments(
@@ -129,7 +133,7 @@ def validate_function_arguments(
             fields[name] = requirement[_toml_value_type(hints.get(name, Any))]
         elif parameter.kind is parameter.VAR_KEYWORD:
             extra_keys_rule = "allow"
-    name = getattr(function, "__name__", "the function")
+    name = callable_name(function, "the function")
     schema = with_config(ConfigDict(extra=extra_keys_rule))(TypedDict(name, fields))  # type: ignore[operator]
     return validate_table_by_schema(key, schema, table, problems, name)
 
@@ -498,7 +502,7 @@ def _parse_axis(key: str, axis: Any, problems: list[str]) -> Any:
         if isinstance(axis, EvenlySpacedAxis):
             grid_function = np.geomspace if axis.scale == "log" else np.linspace
             if axis.scale == "log" and min(axis.first, axis.last) <= 0.0:
-                raise InputError("the values of a logarithmic axis are positive")
+                raise InputError("the values of a logarithmic axis must be positive")
             return grid_function(axis.first, axis.last, axis.points)
         if not isinstance(axis, SampledAxis):
             return axis

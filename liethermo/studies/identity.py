@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from ..tracing.short_form import qualified_name
 from .solve import PointResults, PointSolver
 
 VALUE_RTOL = 1e-10
@@ -134,7 +135,7 @@ def _step_as_json(step: Any) -> Any:
 def _event_as_json(until: Any) -> Any:
     if until is None:
         return None
-    return repr(until) if is_dataclass(until) else f"function {getattr(until, '__qualname__', type(until).__name__)}"
+    return repr(until) if is_dataclass(until) else f"function {qualified_name(until)}"
 
 
 ADDRESS_PATTERN = re.compile(r" at 0x[0-9a-f]+|\bid=\d+")

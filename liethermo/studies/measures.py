@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import InputError
 from ..results.ensemble import Ensemble
 from ..runs.events import Relaxed
+from ..tracing.short_form import qualified_name
 from .axes import is_valid_name
 
 NAMED_MEASURES = {
@@ -184,7 +185,7 @@ class SolutionMeasure(Measure):
 
     @property
     def _function_name(self) -> str:
-        return getattr(self.function, "__qualname__", type(self.function).__name__)
+        return qualified_name(self.function)
 
     def description(self) -> str:
         return f"function {self._function_name}"

@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..errors import InputError
-from ..functions.conditions import collect_conditions, refusal_message
+from ..functions.conditions import collect_conditions, condition_message
 from ..runs.named_parameters import find_parameter, lookup_parameter, named_parameters, replace_parameters
 from ..runs.system_family import Family
 from ..systems import System
+from ..systems.kinds import require_system
 
 FIXED_BATCH_SIZE = 8192
 """Points per call of a compiled program, constant so that results do not depend on the position in a batch."""
@@ -74,7 +75,7 @@ def system_builder(
     Raises
     ------
     InputError
-        If the system has no parameter of a name, or ``build`` is neither a system nor a function.
+        If the system has no parameter of this name, or ``build`` is neither a system nor a function.
     """
     if not isinstance(build, System):
         if not callable(build):
@@ -168,10 +169,7 @@ class StudySystems:
 
     def system_at(self, point: Mapping[str, Any]) -> System:
         """Build and return the system at one point; its constructors check the parameters."""
-        system = self._call_builder(to_python_values(point))
-        if not isinstance(system, System):
-            raise InputError(f"the builder must return a system, got {type(system).__name__}")
-        return system
+        return require_system(self._call_builder(to_python_values(point)), "the builder must return a system")
 
     def inadmissible_points(self, points: PointParameters, n_points: int) -> dict[int, str]:
         """Return an error message, by index, for each point whose parameters violate a condition of the constructors;
@@ -225,7 +223,7 @@ class _ParameterConditions:
         results = evaluate_in_batches(self._evaluate_batch, points, n_points)
         for k, message in enumerate(self._messages):
             for i in map(int, np.flatnonzero(~results[2 * k])):
-                messages_by_index.setdefault(i, refusal_message(message, results[2 * k + 1][i]))
+                messages_by_index.setdefault(i, condition_message(message, results[2 * k + 1][i]))
         return messages_by_index
 
 

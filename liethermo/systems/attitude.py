@@ -18,10 +18,12 @@ from manifolds.groups import maps
 from ..errors import InputError
 from ..functions.energy import Energy, Linear
 from ..tracing.interpret import evaluate_at_points
+from .attitude_layout import AttitudeLayout
 from .base import System
 from .clock import Clock
 from .driven import DrivenSystem
-from .interface import EngineHints
+from .interface import EngineHints, WrappedSystem
+from .kinds import require_kind, user_system
 from .lie_poisson import LiePoissonSystem
 from .lifted import LiftedSystem
 from .rotations import attitude_array
@@ -64,7 +66,7 @@ class AttitudeSystem(LiftedSystem):
         group = momentum_system_of(body).group
         assert group is not None
         self.body, self.reconstruction, self.group, self.space = body, reconstruction, group, None
-        self.dim = body.dim + self._n_real_parts * group.matrix_size**2 + self.impulse_dim
+        self.dim = self.attitude_layout.impulse_start + self.impulse_dim
         self.poisson, self.dissipation, self.momentum_maps = body.poisson, body.dissipation, {}
         self.energy = self.extend(body.energy)
         self.entropy = None if body.entropy is None else self.extend(body.entropy)
@@ -77,29 +79,22 @@ class AttitudeSystem(LiftedSystem):
         kind = self.reconstruction
         has_closed_form = kind not in group_maps or group_maps[kind] is not series_maps[kind]
         hints = super().hints
-        return hints._replace(can_unroll=hints.can_unroll and self._n_real_parts == 1 and has_closed_form)
+        return hints._replace(
+            can_unroll=hints.can_unroll and self.attitude_layout.n_real_parts == 1 and has_closed_form
+        )
 
     @property
     def momentum_system(self) -> LiePoissonSystem:
         """System of mu and the baths, without attitude and clock."""
         return momentum_system_of(self.body)
 
-    def split_state(self, x) -> tuple[jax.Array, jax.Array]:
-        """Return the state of the body, shape (..., n), and the group element, shape (..., m, m), of a state."""
-        n, m = self.body.dim, self.group.matrix_size
-        entries = x[..., n : n + self._n_real_parts * m**2].reshape(*x.shape[:-1], self._n_real_parts, m, m)
-        g = entries[..., 0, :, :]
-        return x[..., :n], g if self._n_real_parts == 1 else g + 1j * entries[..., 1, :, :]
+    @property
+    def attitude_layout(self) -> AttitudeLayout:
+        return AttitudeLayout(self.group, self.body.dim, self.impulse_dim)
 
-    def spatial_impulse(self, x) -> jax.Array:
-        """Return the initial spatial momentum plus the impulse of the torque, shape (..., algebra.dim); or (..., 0)."""
-        return x[..., self.body.dim + self._n_real_parts * self.group.matrix_size**2 :]
-
-    def join_state(self, mu, g, p=None) -> jax.Array:
-        """Return the state with a state of the body, a group element and a spatial impulse: see :meth:`split_state`."""
-        entries = g[..., None, :, :] if self._n_real_parts == 1 else jnp.stack([g.real, g.imag], axis=-3)
-        impulse = [] if p is None else [p]
-        return jnp.concatenate([mu, entries.reshape(*mu.shape[:-1], -1), *impulse], axis=-1)
+    @property
+    def wrapped_system(self) -> WrappedSystem:
+        return WrappedSystem(self.body, AttitudeSystem, (self.reconstruction,))
 
     @property
     def clock(self) -> Clock | None:
@@ -108,7 +103,7 @@ class AttitudeSystem(LiftedSystem):
 
     def body_at_attitude(self, x) -> LiePoissonSystem | DrivenSystem:
         """Return the body with its torque bound to the attitude of a state."""
-        return self.body.bind_attitude(self.split_state(x)[1]) if isinstance(self.body, DrivenSystem) else self.body
+        return self.body.bind_attitude(self.attitude_layout.split(x)[1])
 
     def solved_subsystem(self, x) -> tuple[System, jax.Array]:
         return self.body_at_attitude(x), self.points(x)
@@ -117,7 +112,7 @@ class AttitudeSystem(LiftedSystem):
         """Return the matrix A, shape (..., n, n), for which ``mu @ A`` is the momentum in space."""
         return self.group.Ad(self.group.inverse_map(g))
 
-    def initial_state(self, mu, attitude=None, batch: bool = False, t: float = 0.0) -> jax.Array:
+    def initial_state(self, mu, t: float = 0.0, attitude=None, batch: bool = False) -> jax.Array:
         """Return the state with a momentum and an attitude (default: identity) at the time t; several with ``batch``.
 
         Raises
@@ -134,15 +129,16 @@ class AttitudeSystem(LiftedSystem):
                     raise InputError(
                         f"the attitude is not in {self.group.name}: relative distance {residual:.3g}, tolerance 1e-10"
                     )
-        body = self.body
-        mu = body.initial_state(mu, t, batch) if isinstance(body, DrivenSystem) else body.state(mu, batch)
+        mu = jnp.asarray(self.body.initial_state(mu, t, None, batch))
         batch_shape = jnp.broadcast_shapes(mu.shape[:-1], g.shape[:-2])
         if batch_shape and not batch:
             raise InputError(f"a run has one attitude, of shape {self.group.identity.shape}, got {g.shape}")
         mu, g = jnp.broadcast_to(mu, (*batch_shape, mu.shape[-1])), jnp.broadcast_to(g, (*batch_shape, *g.shape[-2:]))
         if not self.impulse_dim:
-            return self.join_state(mu, g)
-        return self.join_state(mu, g, jnp.einsum("...a,...ab->...b", mu[..., : self.group.dim], self.spatial_action(g)))
+            return self.attitude_layout.join(mu, g)
+        return self.attitude_layout.join(
+            mu, g, jnp.einsum("...a,...ab->...b", mu[..., : self.group.dim], self.spatial_action(g))
+        )
 
     def points(self, x):
         """Return the state of the body, on which energy, entropy and Casimirs depend."""
@@ -153,14 +149,14 @@ class AttitudeSystem(LiftedSystem):
 
     def component_scales(self, k):
         """Return scales of momenta, which have a unit, and of attitudes, which have none."""
-        n, m = self.body.dim, self.dim - self.spatial_impulse(k).shape[-1]
+        n, m = self.body.dim, self.dim - self.impulse_dim
         scales = [self.body.component_scales(k[..., :n]), super().component_scales(k[..., n:m])]
         if m < self.dim:
             scales.append(super().component_scales(k[..., m:]))
         return jnp.concatenate(scales, axis=-1)
 
     def to_user_solution(self, solution):
-        states, g = self.split_state(solution.x)
+        states, g = self.attitude_layout.split(solution.x)
         stats = dataclasses.replace(
             solution.stats,
             attitude_residual=self.max_attitude_residual(solution.x),
@@ -231,13 +227,11 @@ class AttitudeSystem(LiftedSystem):
         return xi[: self.group.dim]
 
     def _vector_field(self, x):
-        (mu, g), body = self.split_state(x), self.body_at_attitude(x)
+        (mu, g), body = self.attitude_layout.split(x), self.body_at_attitude(x)
         p = body.external_torque(mu)[: self.group.dim] @ self.spatial_action(g) if self.impulse_dim else None
-        return self.join_state(body._vector_field(mu), g @ self.group.algebra.hat(self.attitude_velocity(x)), p)
-
-    @property
-    def _n_real_parts(self) -> int:
-        return 2 if self.group.is_complex else 1
+        return self.attitude_layout.join(
+            body._vector_field(mu), g @ self.group.algebra.hat(self.attitude_velocity(x)), p
+        )
 
 
 def _body_blocks(body: System) -> list[slice]:
@@ -255,24 +249,16 @@ def _evaluate_at_states(function: Callable, system: AttitudeSystem, x):
 
 def momentum_system_of(body: System) -> LiePoissonSystem:
     """Return the Lie-Poisson system that a driven system contains, or the system itself."""
-    momentum_system = body.body if isinstance(body, DrivenSystem) else body
-    assert isinstance(momentum_system, LiePoissonSystem)
-    return momentum_system
-
-
-def driven_system_or_none(system: System) -> DrivenSystem | None:
-    """Return the part of a prepared system that records external work, or None."""
-    body = system.body if isinstance(system, AttitudeSystem) else system
-    return body if isinstance(body, DrivenSystem) else None
+    return require_kind(user_system(body), LiePoissonSystem, "an attitude")
 
 
 def _attitude_residual(system: AttitudeSystem, x) -> jax.Array:
-    return system.group.defect(system.split_state(x)[1])
+    return system.group.defect(system.attitude_layout.split(x)[1])
 
 
 def _spatial_momentum_and_scale(system: AttitudeSystem, x) -> tuple[jax.Array, jax.Array]:
     """Return the spatial momentum minus the impulse, and the largest term that is added up in a component of it."""
-    (state, g), p = system.split_state(x), system.spatial_impulse(x)
+    (state, g), p = system.attitude_layout.split(x), system.attitude_layout.impulse(x)
     mu, action = state[: system.group.dim], system.spatial_action(g)
     momentum = mu @ action
     scale = jnp.maximum(jnp.max(jnp.abs(mu) @ jnp.abs(action)), system.body.motion_quantities.momentum_scale(state))
@@ -340,9 +326,7 @@ class TurningSystem(LiftedSystem):
 
     def inner_at(self, x) -> System:
         body = self.inner
-        if isinstance(body, DrivenSystem) and body.torque_laws.needs_attitude:
-            return body.bind_attitude(self._attitude_at(x))
-        return body
+        return body.bind_attitude(self._attitude_at(x)) if body.torque_laws.needs_attitude else body
 
     def _attitude_at(self, x) -> jax.Array:
         group = self.attitude_system.group
@@ -356,7 +340,7 @@ class TurningSystem(LiftedSystem):
             [
                 self.attitude_system.points(x),
                 jnp.zeros(self.attitude_system.group.dim),
-                ANGLE_UNIT * self.attitude_system.spatial_impulse(x),
+                ANGLE_UNIT * self.attitude_system.attitude_layout.impulse(x),
             ]
         )
 

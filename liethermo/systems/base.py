@@ -22,10 +22,10 @@ from ..errors import InputError
 from ..functions.bath_energy import BodyBathsEnergy
 from ..functions.checks import checked_energy, trace_energies, with_polynomial_degrees
 from ..functions.energy import Energy, make_energy
-from ..functions.on_spaces import energy_of_vectors, flatten_site_functions
-from ..tracing.short_form import arguments_form
+from ..functions.on_spaces import energy_of_vectors, functions_of_flat_states
+from ..tracing.short_form import callable_name, format_arguments
 from ..tracing.traced import trace_callables
-from .baths import NO_BATHS, BathEntropy, HeatBaths, checked_baths, poisson_with_baths
+from .baths import ABSENT_BATHS, BathEntropy, HeatBaths, checked_baths, poisson_with_baths
 from .check import AXIOM_TOLERANCE, CheckReport, check_system, require_axioms
 from .conservation import project_covector
 from .interface import SystemInterface
@@ -71,7 +71,7 @@ class System(SystemInterface):
             "torque": self.torque_laws.name,
         }
         name = f"{self.dim} components" if state_space is None else state_space.name
-        return f"{type(self).__name__}({name}, {arguments_form(parts)})"
+        return f"{type(self).__name__}({name}, {format_arguments(parts)})"
 
     @with_library_settings
     def _build(
@@ -133,7 +133,7 @@ class System(SystemInterface):
                 )
         self.dissipation = None
         if dissipation is not None:
-            dissipation = flatten_site_functions(dissipation, self.shape)
+            dissipation = functions_of_flat_states(dissipation, self.shape)
             self.dissipation = _bind_dissipation(self, dissipation)
         if baths.number:
             _attach_baths(self, baths, bath_terms)
@@ -152,18 +152,25 @@ class System(SystemInterface):
             space=None if self.space is None else _drop_last_factor(self.space),
             poisson=self.poisson.first,
             energy=self.energy.body if isinstance(self.energy, BodyBathsEnergy) else self.energy,
-            baths=NO_BATHS,
+            baths=ABSENT_BATHS,
         )
 
     @with_library_settings
     def temperatures(self, x, t=None) -> jax.Array:
         """Return the temperatures of the baths, shape (..., baths), for states of shape (..., n).
 
+        With one bath, ``system.temperature(x)`` returns its temperature, shape (...).
+
         Parameters
         ----------
         x : array, shape (..., n)
         t : float or array, shape (...), optional
             The times of the states, if the temperatures depend on it.
+
+        Raises
+        ------
+        InputError
+            If there are no baths, or their temperatures depend on time and t is missing.
         """
         if not self.baths.number:
             raise InputError("this system has no baths. Give it baths=lt.HeatBaths(...)")
@@ -177,9 +184,30 @@ class System(SystemInterface):
         gradient = jnp.vectorize(lambda y, t: energy.at_time(t).gradient(y), signature="(m),()->(m)")
         return gradient(entropies, jnp.asarray(t, dtype=jnp.float64))
 
+    def temperature(self, x, t=None) -> jax.Array:
+        """Return the temperature of a system with one bath, or with one temperature, shape (...).
+
+        Parameters
+        ----------
+        x : array, shape (..., n)
+        t : float or array, shape (...), optional
+            The times of the states, if the temperature depends on it.
+
+        Raises
+        ------
+        InputError
+            If the system has no temperature, or several: see :meth:`temperatures`.
+        """
+        T = self.temperatures(x, t)
+        if T.shape[-1] != 1:
+            raise InputError(
+                f"this system has {T.shape[-1]} temperatures. Use system.temperatures(x), of shape (..., {T.shape[-1]})"
+            )
+        return T[..., 0]
+
     def energy_of_vectors(self, energy: Energy) -> Energy:
         """Return a function of flat states from a function of states in the shape that users see."""
-        return energy_of_vectors(flatten_site_functions(energy, self.shape), self.space)
+        return energy_of_vectors(functions_of_flat_states(energy, self.shape), self.space)
 
     def _trace_dissipation(self, dissipation: Dissipation) -> Dissipation:
         """Return the dissipation with its plain functions traced for the arguments that its force passes to them."""
@@ -344,7 +372,7 @@ def _attach_baths(system: System, baths: HeatBaths, bath_terms: tuple[Dissipatio
     if system.dissipation is not None or not bath_terms:
         system.dissipation = couple_to_baths(system.total_dissipation, body, m, baths.has_positive_temperatures, extend)
     if body.space is not None and body.space.dtype.kind == "c":
-        raise InputError(f"baths are for real spaces, and {body.space.name} is complex")
+        raise InputError(f"baths need a real space, but {body.space.name} is complex")
     system.baths, system.dim = baths, n + m
     system.space = None if body.space is None else mf.Product(body.space, mf.Euclidean(m))
     system.poisson = poisson_with_baths(body.poisson, m)
@@ -370,7 +398,7 @@ def name_momentum_maps(given) -> dict[str, Any]:
         return dict(given)
     if not isinstance(given, Sequence) or isinstance(given, str):
         raise InputError(f"momentum_maps must be a dict or a sequence of functions, got {type(given).__name__}")
-    return {getattr(J, "__name__", f"J{i + 1}"): J for i, J in enumerate(given)}
+    return {callable_name(J, f"J{i + 1}"): J for i, J in enumerate(given)}
 
 
 __all__ = ["AXIOM_TOLERANCE", "System", "name_momentum_maps"]

@@ -21,14 +21,14 @@ from ..functions.bath_energy import (
     DrivenReservoirEnergy,
     ReservoirEnergy,
     ZeroEnergy,
-    bath_terms,
+    bath_energy_terms,
     make_bath_energy,
 )
 from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers
 from ..functions.energy import Energy, Sum
 from ..functions.mechanics import Each
-from ..tracing.short_form import arguments_form
+from ..tracing.short_form import format_arguments
 
 
 class HeatBaths(Module):
@@ -59,6 +59,8 @@ class HeatBaths(Module):
     ----------
     energy : Energy
         Total energy of the baths as a function of their entropies, shape (number,).
+    number : int
+        The number of baths. ``system.baths.number`` is 0 for a system without baths.
 
     Raises
     ------
@@ -82,8 +84,8 @@ class HeatBaths(Module):
 
     def __repr__(self) -> str:
         if isinstance(self.energy, BathEnergy):
-            return f"HeatBaths({arguments_form(vars(self.energy))})"
-        return f"HeatBaths({arguments_form(vars(self))})"
+            return f"HeatBaths({format_arguments(vars(self.energy))})"
+        return f"HeatBaths({format_arguments(vars(self))})"
 
     def __init__(self, capacity=1.0, temperature=1.0, number: int | None = None, energy=None):
         if number is None:
@@ -122,13 +124,14 @@ class HeatBaths(Module):
         constant = np.array([i for i, f in enumerate(functions) if f is None and i not in driven], dtype=int)
         if constant.size:
             terms.append(make_bath_energy(C[constant], T[constant]).on(constant))
-        self.energy = Sum.of(terms)
+        self.energy = Sum.from_terms(terms)
 
     @property
     def has_positive_temperatures(self) -> bool:
         """True if the temperatures are positive in every state by construction."""
         return all(
-            isinstance(term, BathEnergy | ReservoirEnergy | DrivenReservoirEnergy) for term in bath_terms(self.energy)
+            isinstance(term, BathEnergy | ReservoirEnergy | DrivenReservoirEnergy)
+            for term in bath_energy_terms(self.energy)
         )
 
     @property
@@ -143,14 +146,14 @@ class HeatBaths(Module):
         return jnp.where(jnp.isfinite(self.energy.capacity), self.energy.capacity, 1.0)
 
 
-class _NoBaths(HeatBaths):
+class _AbsentBaths(HeatBaths):
     """Baths of number zero, of a system without baths."""
 
     def __init__(self):
         self.energy, self.number = ZeroEnergy(), 0
 
 
-NO_BATHS = _NoBaths()
+ABSENT_BATHS = _AbsentBaths()
 """The baths of a system that has none."""
 
 
@@ -163,7 +166,7 @@ def checked_baths(baths: HeatBaths | None) -> HeatBaths:
     """
     if not isinstance(baths, HeatBaths | None):
         raise InputError(f"baths must be lt.HeatBaths(...), got {type(baths).__name__}")
-    return NO_BATHS if baths is None else baths
+    return ABSENT_BATHS if baths is None else baths
 
 
 def _entries_of_baths(value, what: str, number: int) -> list:

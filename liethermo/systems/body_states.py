@@ -41,9 +41,10 @@ def is_given_by_velocity(system, x, angular_velocity, instead: str, **details) -
         If neither or both are given, or the system has no angular velocity.
     """
     if angular_velocity is None:
-        if x is None or any(value is not None for value in details.values()):
-            names = " and ".join(f"{name}=" for name in details)
-            raise InputError(f"state needs x, or angular_velocity= with {names} as wanted")
+        if x is None:
+            raise InputError("state needs x or angular_velocity=")
+        if names := [f"{name}=" for name, value in details.items() if value is not None]:
+            raise InputError(f"{' and '.join(names)} of a state needs angular_velocity=, not x")
         return False
     if x is not None:
         raise InputError("state needs x or angular_velocity=, got both")
@@ -52,8 +53,8 @@ def is_given_by_velocity(system, x, angular_velocity, instead: str, **details) -
     return True
 
 
-def checked_velocity(angular_velocity, rotor_rates, dim: int, batch: bool) -> jax.Array:
-    """Return the velocity (Omega, w), shape (..., dim), of an angular velocity and the rates of rotors."""
+def checked_velocity(angular_velocity, rotor_rates, dim: int, batch: bool, degrees: bool) -> jax.Array:
+    """Return the velocity (Omega, w) in radians, shape (..., dim), of an angular velocity and the rates of rotors."""
     omega = checked_numbers(angular_velocity, "angular_velocity")
     if omega.shape[-1:] != (3,) or (omega.ndim > 1 and not batch):
         expected = "(..., 3)" if batch else "(3,)"
@@ -72,7 +73,7 @@ def checked_velocity(angular_velocity, rotor_rates, dim: int, batch: bool) -> ja
     parts = (jnp.broadcast_to(part, (*shape, part.shape[-1])) for part in (omega, rates))
     velocity = jnp.concatenate([*parts], axis=-1)
     require_condition(velocity, lambda v: abs(v) < jnp.inf, "velocities must be finite, got {value}")
-    return velocity
+    return jnp.deg2rad(velocity) if degrees else velocity
 
 
 def momentum_of_velocity(energy: Energy, velocity) -> jax.Array:

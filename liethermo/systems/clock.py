@@ -49,6 +49,10 @@ class Clock(Module):
         """Return the time t of states, shape (...), clipped to the span of the run."""
         return self.span.clip(x[..., self.index] / self.unit)
 
+    def work(self, x) -> jax.Array:
+        """Return the work W of states, shape (...)."""
+        return x[..., self.index + 1] / self.unit
+
     def work_direction(self, dim: int) -> jax.Array:
         """Return the displacement, shape (dim,), that adds one unit to the work done."""
         return jnp.zeros(dim).at[self.index + 1].set(self.unit)
@@ -76,7 +80,7 @@ def system_of_step(system: AnySystem, x) -> AnySystem:
     clock = system.clock
     if clock is None or not clock.span.breaks.size:
         return system
-    return replace_time_span(system, clock.span.interval_at(clock.time(x)))
+    return replace_time_span(system, clock.span.interval_between_breaks_at(clock.time(x)))
 
 
 def add_jump_of_energy(clock: Clock, x, amount) -> jax.Array:

@@ -21,6 +21,7 @@ from ..functions.indices import ComponentMap
 from ..functions.time_span import TimeSpan
 from .base import System
 from .clock import WORK_NAME, Clock
+from .interface import WrappedSystem
 from .lifted import LiftedSystem
 
 CLOCK_UNIT = 2.0**-100
@@ -53,7 +54,7 @@ class DrivenSystem(LiftedSystem):
     attitude : array, shape (m, m), or None
         Attitude at which a torque is evaluated that depends on it: see :meth:`bind_attitude`.
     torque : array, shape (n,), or None
-        Fixed torque: see :meth:`with_torque`.
+        Fixed torque, which replaces that of the body.
     span : TimeSpan
         Span of a run: functions of time are evaluated at times in it only.
     """
@@ -69,7 +70,7 @@ class DrivenSystem(LiftedSystem):
         self.body, self.unit, self.dim, self.attitude, self.torque = body, unit, body.dim + 2, None, None
         self.space = None if body.space is None else mf.Product(body.space, mf.Euclidean(2))
         if body.space is not None and body.space.dtype.kind == "c":
-            raise InputError(f"an energy that depends on time is for real spaces, and {body.space.name} is complex")
+            raise InputError(f"an energy that depends on time needs a real space, but {body.space.name} is complex")
         self.poisson = ProductPoisson(body.poisson, _ClockPoisson(unit))
         energy = Sum((*map(self._extend_term, body.energy.terms), _NegativeWork(unit)))
         self.energy = energy if self.space is not None else with_polynomial_degrees(energy, self.dim)
@@ -85,9 +86,13 @@ class DrivenSystem(LiftedSystem):
 
     # -- the state --------------------------------------------------------------------------------------------------
 
-    def initial_state(self, x, t: float, batch: bool = False) -> jax.Array:
+    @property
+    def wrapped_system(self) -> WrappedSystem:
+        return WrappedSystem(self.body, DrivenSystem, (self.unit,))
+
+    def initial_state(self, x, t: float = 0.0, attitude=None, batch: bool = False) -> jax.Array:
         """Return the state at a time with zero work; several states with ``batch``."""
-        x = self.body.state(x, batch)
+        x = jnp.asarray(self.body.initial_state(x, t, attitude, batch))
         clock = jnp.broadcast_to(jnp.array([t * self.unit, 0.0]), (*x.shape[:-1], 2))
         return jnp.concatenate([x, clock], axis=-1)
 
@@ -101,10 +106,6 @@ class DrivenSystem(LiftedSystem):
     def time(self, x) -> jax.Array:
         """Return the time t of states, shape (...), clipped to the span of the run."""
         return self.clock.time(x)
-
-    def work(self, x) -> jax.Array:
-        """Return the work W of states, shape (...)."""
-        return x[..., -1] / self.unit
 
     def samples(self, count, seed=0, scale=1.0):
         times = scale * np.random.default_rng(seed).standard_normal(count)
@@ -149,10 +150,6 @@ class DrivenSystem(LiftedSystem):
     def bind_attitude(self, attitude) -> DrivenSystem:
         """Return the system with its torque evaluated at an attitude, shape (m, m)."""
         return replace_fields(self, attitude=attitude) if self.torque_laws.needs_attitude else self
-
-    def with_torque(self, torque) -> DrivenSystem:
-        """Return the system with a fixed torque, shape (body.dim,)."""
-        return replace_fields(self, torque=torque)
 
     def solve_at_spins(self, x, dH, dS, noise_rates, others, half_step, k):
         inner, clock_velocity = self.inner_at(x).drop_torque(), _clock_velocity(dH, self.unit) + others[-2:]

@@ -24,10 +24,10 @@ from ..functions.checks import with_polynomial_degrees
 from ..functions.energy import Energy
 from ..functions.surface import ConstraintSurface
 from ..tracing.interpret import evaluate_at_points
-from ..tracing.programs import subprogram
+from ..tracing.programs import jit_subprogram
 from .base import System
 from .domain import Domain
-from .interface import EngineHints
+from .interface import EngineHints, WrappedSystem
 
 TANGENCY_RTOL = 1e-12
 """Largest component normal to the level sets, relative to the velocity, of a field that counts as tangent to them."""
@@ -78,9 +78,8 @@ class EmbeddedSystem(System):
     ledger = forward_to("manifold")
 
     @property
-    def projection_flags(self) -> tuple[bool, bool]:
-        """Arguments ``is_tangent`` and ``is_projection_trivial`` of the constructor."""
-        return self.is_tangent, self.is_projection_trivial
+    def wrapped_system(self) -> WrappedSystem:
+        return WrappedSystem(self.manifold, EmbeddedSystem, (self.is_tangent, self.is_projection_trivial))
 
     @property
     def surface(self) -> ConstraintSurface:
@@ -103,7 +102,6 @@ class EmbeddedSystem(System):
     energy_of_vectors = forward_to("manifold")
     samples = forward_to("manifold")
     drop_baths = forward_to("manifold")
-    _around = forward_to("manifold")
 
     def to_user_solution(self, solution):
         name = dissipation_name(self.manifold.dissipation)
@@ -114,7 +112,7 @@ class EmbeddedSystem(System):
     # -- dynamics -----------------------------------------------------------------------------------------------------
 
     def at_time(self, t, attitude=None) -> EmbeddedSystem:
-        return EmbeddedSystem(self.manifold.at_time(t), *self.projection_flags) if self.is_driven else self
+        return EmbeddedSystem(self.manifold.at_time(t), *self.wrapped_system.arguments) if self.is_driven else self
 
     def raise_index(self, x, alpha):
         """Return the part of a gradient tangent to the level sets, the direction of corrections."""
@@ -161,7 +159,7 @@ class _TangentDissipation(LiftedDissipation):
         return self.inner.divergence(self.manifold, system.surface.project_state(x))
 
 
-@subprogram
+@jit_subprogram
 def _tangent_force(force: _TangentDissipation, x, dH, dS, dL) -> jax.Array:
     geometry = force.lifted_geometry(force.manifold, x)
     velocity = force.inner.force(geometry.system, geometry.x, *geometry.inner_gradients(dH, dS, dL))
@@ -229,7 +227,7 @@ def _tangential_part(system: System, x, w):
     return _tangential_part_in_space(_require_space(system), x, w)
 
 
-@subprogram
+@jit_subprogram
 def _tangential_part_in_space(space: mf.Space, x, w):
     return space.to_vector(space._tangential_part(space.from_vector(x), space.from_vector(w)))
 
@@ -278,7 +276,7 @@ class ChartSystem(System):
 
     @property
     def hints(self) -> EngineHints:
-        return super().hints._replace(is_smooth=self.manifold.hints.is_smooth)
+        return super().hints._replace(is_smooth=self.manifold.hints.is_smooth, has_fixed_levels=False)
 
     def freeze_at(self, x) -> System:
         if self.place is not None:

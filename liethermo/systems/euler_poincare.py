@@ -79,7 +79,8 @@ class EulerPoincareSystem(LiePoissonSystem):
     entropy, dissipation, momentum_maps, validate, group, reconstruction, torque
         As for :class:`LiePoissonSystem`; functions of mu.
     force : function from xi to a covector, optional
-        F of (3.2): conserves the energy whatever it is. For a force that raises an entropy use ``dissipation``.
+        The force F of (3.2), which conserves the energy for any function. For a force that raises an entropy use
+        ``dissipation``.
     """
 
     lagrangian: Energy
@@ -259,7 +260,14 @@ class EulerPoincareClosedSystem(LedgerSystem):
         self._assemble(structure, n + 1, energy, forces, momentum_maps, validate)
 
     def state(
-        self, x=None, batch: bool = False, *, angular_velocity=None, rotor_rates=None, temperature=None
+        self,
+        x=None,
+        batch: bool = False,
+        *,
+        angular_velocity=None,
+        rotor_rates=None,
+        temperature=None,
+        degrees: bool = False,
     ) -> jax.Array:
         """Return a state of this system: ``x``, checked, or the state with a given angular velocity and temperature.
 
@@ -275,16 +283,18 @@ class EulerPoincareClosedSystem(LedgerSystem):
             The other velocities, such as those of wheels relative to the body (rad / time); zero by default.
         temperature : float, optional
             Temperature ``-l_S``, from which Newton's method finds S; by default ``S = 0``.
+        degrees : bool
+            If true, the angular velocity and the other velocities are in degrees / time.
 
         Raises
         ------
         InputError
             If neither or both of x and the angular velocity are given, or no state has these values.
         """
-        details = {"rotor_rates": rotor_rates, "temperature": temperature}
+        details = {"rotor_rates": rotor_rates, "temperature": temperature, "degrees": degrees or None}
         if not is_given_by_velocity(self, x, angular_velocity, "velocity xi", **details):
             return super().state(x, batch)
-        xi = checked_velocity(angular_velocity, rotor_rates, self.algebra.dim, batch)
+        xi = checked_velocity(angular_velocity, rotor_rates, self.algebra.dim, batch, degrees)
         if temperature is None:
             S = jnp.zeros((*xi.shape[:-1], 1))
         else:

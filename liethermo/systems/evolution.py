@@ -16,7 +16,7 @@ from ..dissipation.base import SkewFriction, nondecreasing_law_if
 from ..errors import InputError
 from ..functions.checks import checked_energy, with_polynomial_degrees
 from ..functions.energy import Energy, Quadratic, make_energy
-from ..functions.mechanics import is_mechanical
+from ..functions.mechanics import is_kinetic_plus_potential
 from ..functions.time_span import required_argument_count
 from .base import System
 from .embedded import EmbeddedSystem
@@ -57,7 +57,7 @@ class ContactManifoldSystem(System):
         entropy: Energy | None = None
         friction: LiouvilleFriction = ReebDrift()
         if self.is_isolated:
-            law = nondecreasing_law_if(is_mechanical(function, dim, space))
+            law = nondecreasing_law_if(is_kinetic_plus_potential(function, dim, space))
             entropy, friction = entropy_component(dim), LiouvilleFriction(law=law)
         parts = structure, dim, energy, entropy, friction, momentum_maps, validate
         self._build(*parts, state_space(space), check_poisson=space is None)
@@ -159,6 +159,10 @@ class EvolutionSystem(MomentumContactSystem):
         """Return the temperature ``T = H_S`` of states, shape (...), at the time t if the energy depends on it."""
         return evaluate_batch(self, lambda system, y: system.energy.gradient(y)[-1], x, t, "()")
 
+    def temperatures(self, x, t=None) -> jax.Array:
+        """Return the temperature with an axis of length 1, shape (..., 1): see :meth:`temperature`."""
+        return self.temperature(x, t)[..., None]
+
 
 class ContactSystem(MomentumContactSystem):
     """The plain contact field X_H of an energy on T*Q x R, for comparison [SML §2.2].
@@ -207,7 +211,7 @@ def configuration_space(contact: mf.SplitContact) -> mf.Space | None:
 
 
 def check_space(space) -> mf.Space:
-    """Return the space of positions, or raise an InputError if it is no space."""
+    """Return the space of positions, or raise an InputError if it is not a space."""
     if not isinstance(space, mf.Space):
         raise InputError(f"space must be a manifolds.Space, such as mf.Sphere(2), got {type(space).__name__}")
     return space

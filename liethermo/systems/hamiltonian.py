@@ -28,7 +28,7 @@ from ..functions.density import (
     ExpectationValue,
     MeanEnergy,
     ModulatedExpectationValue,
-    choose_reference_level,
+    lower_level_of_smallest_gap,
 )
 from ..functions.energy import Energy, TimeDependent
 from ..functions.time_span import ContinuedSpline
@@ -60,7 +60,7 @@ def hamiltonian_energy(hamiltonian, times=None) -> tuple[int, Energy]:
     H = checked_hermitian(checked_square_matrix(hamiltonian, "the Hamiltonian"), "the Hamiltonian")
     with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
         b = jnp.asarray(mf.DensityMatrices(len(H)).vector(H))
-        reference = jnp.asarray(choose_reference_level(np.diag(H).real))
+        reference = jnp.asarray(lower_level_of_smallest_gap(np.diag(H).real))
     return len(H), MeanEnergy(b, reference)
 
 
@@ -98,7 +98,7 @@ def _energy_of_terms(terms: Sequence, times) -> tuple[int, Energy]:
         H, f = term if is_pair else (term, None)
         f = f if f is None or callable(f) else _coefficient_function(f, times, i)
         if isinstance(H, list | tuple) and H and _is_hamiltonian_term(H[0]):
-            raise InputError(f"term {i} of the Hamiltonian is a matrix, or a pair of a matrix and a function of t")
+            raise InputError(f"term {i} of the Hamiltonian must be a matrix, or a pair of a matrix and a function of t")
         H = checked_hermitian(H, f"term {i} of the Hamiltonian")
         if H.shape != (first_matrix := (constant + modulated + [H])[0]).shape:
             raise InputError(
@@ -118,7 +118,7 @@ def _energy_of_terms(terms: Sequence, times) -> tuple[int, Energy]:
     with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
         matrices = (sum(constant, np.zeros_like(H)), *modulated)
         static, *rows = (jnp.asarray(structure.vector(a)) for a in matrices)
-        reference = jnp.asarray(choose_reference_level(np.asarray(static)[: structure.size]))
+        reference = jnp.asarray(lower_level_of_smallest_gap(np.asarray(static)[: structure.size]))
     if not modulated:
         return structure.size, MeanEnergy(static, reference)
     initial = static
@@ -138,8 +138,8 @@ def _coefficient_function(coefficient, times, i: int) -> Callable:
     values = np.asarray(coefficient)
     if values.dtype.kind not in "fiu" or values.ndim != 1:
         raise InputError(
-            f"term {i} of the Hamiltonian is a matrix, or a pair of a matrix and a function of t, or of a matrix and "
-            f"an array of real numbers; its second entry is of type {type(coefficient).__name__}"
+            f"term {i} of the Hamiltonian must be a matrix, or a pair of a matrix and a function of t or an array of "
+            f"real numbers, got a second entry of type {type(coefficient).__name__}"
         )
     if times is None:
         raise InputError(f"the coefficient of term {i} of the Hamiltonian is an array, so it needs times=")

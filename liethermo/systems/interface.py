@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -15,9 +16,11 @@ import scipy
 
 from ..dissipation.base import ABSENT_DISSIPATION, Dissipation, LawName
 from ..dissipation.geometry import Geometry
+from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.surface import Surface
-from .baths import NO_BATHS, HeatBaths
+from .attitude_layout import AttitudeLayout
+from .baths import ABSENT_BATHS, HeatBaths
 from .clock import Clock
 from .conditions import RunCondition
 from .domain import Domain
@@ -75,6 +78,30 @@ class MotionQuantities(NamedTuple):
     momentum_scale: Callable[[Any], jax.Array] = lambda x: jnp.zeros(())
 
 
+class WrappedSystem(NamedTuple):
+    """The system that another one wraps for a run, and how.
+
+    Attributes
+    ----------
+    system : System
+        The system inside.
+    wrap : function of a system and ``arguments`` to a system
+        Wraps another system of the same kind.
+    arguments : tuple
+    """
+
+    system: Any
+    wrap: Callable[..., Any]
+    arguments: tuple = ()
+
+
+MISSING_GROUP_MESSAGE = (
+    "an attitude is for a system with a group. Give LiePoissonSystem one, such as group=mf.SO(3), or a model of a body "
+    "attitude=True"
+)
+"""Error message for an attitude of a system without a group."""
+
+
 class SparseNewton(NamedTuple):
     """Functions of a system for Newton's method with a sparse Jacobian; by default no pattern is known.
 
@@ -104,12 +131,16 @@ class EngineHints(NamedTuple):
         Whether the system consists of matrix functions, which XLA compiles more slowly than the compiled engine.
     is_smooth : bool
         Whether the vector field is at least twice differentiable.
+    has_fixed_levels : bool
+        Whether the conserved functions have the same levels at every step; False in coordinates that are new at every
+        step.
     """
 
     can_unroll: bool = True
     can_unroll_newton: bool = True
     has_matrix_functions: bool = False
     is_smooth: bool = True
+    has_fixed_levels: bool = True
 
 
 @dataclass(frozen=True)
@@ -177,7 +208,7 @@ class SystemInterface(Geometry):
     """Names of the functions that the dissipation has to preserve, in their order."""
     invariant_verdicts: InvariantVerdicts | None = eqx.field(static=True, kw_only=True, default=None)
     """Functions that the system conserves, if they were determined near the states of a run."""
-    baths: HeatBaths = eqx.field(kw_only=True, default=NO_BATHS)
+    baths: HeatBaths = eqx.field(kw_only=True, default=ABSENT_BATHS)
     """Baths that take the heat of the dissipation, if any; their entropies are the last components of a state."""
     production_name: ClassVar[str] = "dS/dt"
 
@@ -195,7 +226,7 @@ class SystemInterface(Geometry):
     def inertia(self) -> np.ndarray | None:
         """The tensor of inertia, shape (3, 3), of a rigid body whose state begins with its angular momentum.
 
-        All internal parts count as fixed. None if the system is no such body, or the tensor is not known.
+        All internal parts count as fixed. None if the system is not such a body, or the tensor is not known.
         """
         return None
 
@@ -243,10 +274,6 @@ class SystemInterface(Geometry):
     def domain(self) -> Domain:
         """Conditions that a state must satisfy beside finite components, with functions that explain them."""
         return Domain()
-
-    def outside(self, x) -> str:
-        """Return why the state x, shape (n,), is outside the :attr:`domain`; "" if it is inside."""
-        return self.domain.why_outside(x)
 
     def run_conditions(self, x: np.ndarray, t: np.ndarray, guarantees: frozenset[str]) -> tuple[RunCondition, ...]:
         """Return conditions of a run beside its laws, such as positive density matrices, for the rows of an audit.
@@ -380,6 +407,33 @@ class SystemInterface(Geometry):
         return ()
 
     # -- states as users see them -------------------------------------------------------------------------------------
+
+    @property
+    def wrapped_system(self) -> WrappedSystem | None:
+        """The system that this one wraps for a run, with a clock, an attitude or an embedding; None without one."""
+        return None
+
+    @property
+    def attitude_layout(self) -> AttitudeLayout | None:
+        """Components of a state that hold an attitude and an impulse; None if there are none."""
+        return None
+
+    @abstractmethod
+    def state_array(self, x, batch: bool = False) -> np.ndarray | jax.Array:
+        """Return the state x, checked; several states with ``batch``."""
+
+    def initial_state(self, x, t: float = 0.0, attitude=None, batch: bool = False) -> jax.Array | np.ndarray:
+        """Return the state of a run that starts at the user's state x, at the time t; several states with ``batch``.
+
+        Raises
+        ------
+        InputError
+            If x is no state, or an attitude is given and the system has no group.
+        """
+        del t  # without a clock
+        if attitude is not None:
+            raise InputError(MISSING_GROUP_MESSAGE)
+        return self.state_array(x, batch)
 
     def user_state(self, x) -> jax.Array:
         """Return the state as the user sees it, as a point; event functions receive it."""

@@ -154,7 +154,7 @@ class LedgerSystem(System):
         names = "(q, v, S, t)" if self.first_velocity_index else "(xi, S, t)"
         count = names.count(",") + 1
         if len(arguments) not in (count - 1, count):
-            raise InputError(f"forces and heat are functions of {names}, and {len(arguments)} arguments were given")
+            raise InputError(f"forces and heat are functions of {names}, but {len(arguments)} arguments were given")
         return arguments if len(arguments) == count else (*arguments, 0.0)
 
     def friction_at(self, arguments: tuple, T) -> jax.Array:
@@ -175,9 +175,14 @@ class LedgerSystem(System):
     def temperature_at(self, y) -> jax.Array:
         """Return the temperature at y, a state without ledger, shape ()."""
 
-    def temperature(self, x) -> jax.Array:
-        """Return the temperature, ``-dL/dS``, at states, shape (...)."""
+    def temperature(self, x, t=None) -> jax.Array:
+        """Return the temperature, ``-dL/dS``, at states, shape (...); it does not depend on the time t."""
+        del t
         return jnp.vectorize(self.temperature_at, signature="(n)->()")(self.drop_ledger(x))
+
+    def temperatures(self, x, t=None) -> jax.Array:
+        """Return the temperature with an axis of length 1, shape (..., 1): see :meth:`temperature`."""
+        return self.temperature(x, t)[..., None]
 
     # -- checks -------------------------------------------------------------------------------------------------------
 

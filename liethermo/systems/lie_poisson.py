@@ -161,7 +161,15 @@ class LiePoissonSystem(TorqueSystem):
         return quantities._replace(momentum_scale=lambda x: jnp.max(jnp.abs(x[rotors])))
 
     def state(
-        self, x=None, batch: bool = False, *, angular_velocity=None, rotor_rates=None, temperature=None, t=None
+        self,
+        x=None,
+        batch: bool = False,
+        *,
+        angular_velocity=None,
+        rotor_rates=None,
+        temperature=None,
+        t=None,
+        degrees: bool = False,
     ) -> jax.Array:
         """Return ``x`` as a checked state, or the state of a rigid body with a given angular velocity.
 
@@ -169,8 +177,8 @@ class LiePoissonSystem(TorqueSystem):
         ----------
         x : array, shape (n,), or (..., n) with ``batch``; optional
             A state. InputError if it is none, or if both or neither of it and the angular velocity are given.
-        batch : bool
-            Whether leading axes are several states.
+        batch, degrees : bool
+            Whether leading axes are several states, and whether the rates are in degrees / time.
         angular_velocity : array, shape (3,), or (..., 3) with ``batch``; optional
             Omega in body axes (rad / time), instead of x. The momentum is the one at which ``dH/dmu = (Omega, w)``.
         rotor_rates : array, shape (k,), or (..., k) with ``batch``; optional
@@ -186,12 +194,12 @@ class LiePoissonSystem(TorqueSystem):
         >>> body.state(angular_velocity=(0.1, 0.2, 0.3), temperature=1.0).tolist()
         [0.30000000000000004, 0.4, 0.3, 0.0]
         """
-        details = {"rotor_rates": rotor_rates, "temperature": temperature}
+        details = {"rotor_rates": rotor_rates, "temperature": temperature, "degrees": degrees or None}
         if not is_given_by_velocity(self, x, angular_velocity, "momentum", **details):
             return super().state(x, batch)
         if temperature is not None and not self.baths.number:
             raise InputError("temperature= needs a system with baths. Build the system with baths=lt.HeatBaths(...)")
-        velocity = checked_velocity(angular_velocity, rotor_rates, self.algebra.dim, batch)
+        velocity = checked_velocity(angular_velocity, rotor_rates, self.algebra.dim, batch, degrees)
         momentum = self.momentum_of_velocity(velocity, t)
         if temperature is not None:
             y = entropies_of_temperatures(self.baths, temperature)
@@ -211,6 +219,10 @@ class LiePoissonSystem(TorqueSystem):
 
     # -- the torque -----------------------------------------------------------------------------------------------
 
+    def bind_attitude(self, attitude) -> LiePoissonSystem:
+        """Return the system itself: without a clock its torque, if any, is frozen at a time and an attitude."""
+        return self
+
     def _set_torque(self, torque) -> None:
         """Set the fields of the torque of a system with an algebra and a group."""
         self.torque, self.torque_argument_counts = traced_torque_and_argument_counts(torque, self.algebra, self.group)
@@ -226,10 +238,11 @@ class LiePoissonSystem(TorqueSystem):
             return TORQUE_FREE_LAWS
         n_momenta = self.algebra.dim if self.group is None else self.group.dim
         free, names = self.torque_free_components, self.algebra.basis_names
+        takes_attitude = max(self.torque_argument_counts) > MAX_ARGUMENTS_WITHOUT_ATTITUDE
         return TorqueLaws(
             torque_name(self.torque),
             has_impulse=not set(range(n_momenta)) <= set(free),
-            needs_attitude=max(self.torque_argument_counts) > MAX_ARGUMENTS_WITHOUT_ATTITUDE,
+            needs_attitude=takes_attitude and not self.has_fixed_attitude,
             changed_casimirs=frozenset(self.momentum_casimirs()) - _casimirs_of_components(self.algebra, names, free),
         )
 

@@ -24,6 +24,7 @@ from ..tracing.interpret import evaluate_at_points
 from .base import System
 from .conservation import dissipation_keeps_casimirs
 from .invariants import resolve_invariants_near, stack_gradients, systems_at_test_times
+from .kinds import require_system
 from .leaf_stability import has_definite_integral, retract
 
 REST_RTOL = 1e-7
@@ -131,8 +132,7 @@ def frozen_system(system: System, t: float | None) -> System:
     InputError
         If the system depends on time and no time is given, or a torque needs an attitude.
     """
-    if not isinstance(system, System):
-        raise InputError(f"system must be a system such as lt.models.rigid_body(), got {type(system).__name__}")
+    require_system(system, "system must be a system such as lt.models.rigid_body()")
     if is_traced(system):
         raise InputError("the parameters of the system are traced values. Call this function outside of jax.jit")
     if system.torque_laws.needs_attitude:
@@ -370,7 +370,7 @@ def linearise(system: System, x, t: float | None = None) -> Linearisation:
     Raises
     ------
     InputError
-        If x is no equilibrium, or the system depends on time and t is missing.
+        If x is not an equilibrium, or the system depends on time and t is missing.
 
     Examples
     --------

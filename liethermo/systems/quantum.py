@@ -276,7 +276,7 @@ class QuantumSystem(System):
         """
         rho = self.reduced(x, part)
         if rho.shape[-1] != 2:
-            raise InputError(f"a Bloch vector belongs to a qubit, and part {part!r} has {rho.shape[-1]} levels")
+            raise InputError(f"a Bloch vector needs a qubit, but part {part!r} has {rho.shape[-1]} levels")
         coherence = rho[..., 0, 1]
         return jnp.stack([2.0 * coherence.real, -2.0 * coherence.imag, (rho[..., 0, 0] - rho[..., 1, 1]).real], axis=-1)
 
@@ -546,7 +546,7 @@ class QuantumSystem(System):
             for term in s.total_dissipation.terms:
                 if not isinstance(term, ThermalJumps):
                     raise InputError(
-                        f"{type(term).__name__} of a part is none of a product. Give it to the product as a whole"
+                        f"{type(term).__name__} of a part does not act on a product. Give it to the product as a whole"
                     )
                 operators = [tensor_with_identity(np.asarray(V), k, sizes) for V in term.operators]
                 terms.append(term.replace_operators(operators, term.bath + offset))

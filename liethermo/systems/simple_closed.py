@@ -156,7 +156,8 @@ def join_lagrangian_arguments(lagrangian, space: mf.Space | None = None):
     """Return a Lagrangian as a function of one array."""
     if callable(lagrangian) and not isinstance(lagrangian, Energy) and required_argument_count(lagrangian) == 4:
         raise InputError(
-            "the Lagrangian of a simple closed system is one of (q, v, S); what depends on time is external"
+            "the Lagrangian of a simple closed system must be a function of (q, v, S). Give forces that depend on time "
+            "as external="
         )
     return join_arguments(lagrangian, space)
 

@@ -29,12 +29,12 @@ from ..functions.magnetism.spin_torques import checked_spin_torque
 from ..functions.on_spaces import (
     HalfSquareOfSpin,
     HalfSumOfSquares,
-    Spheres,
+    SphereLengths,
     energy_in_component_order,
-    flatten_site_functions,
+    functions_of_flat_states,
     interaction_range,
-    to_component_order,
-    to_site_order,
+    spins_to_component_order,
+    spins_to_site_order,
 )
 from .base import System
 from .baths import HeatBaths, checked_baths, poisson_with_baths
@@ -123,7 +123,7 @@ class SpinSystem(TorqueSystem):
         self._build(poisson, poisson.dim, energy, None, dissipation, momentum_maps, validate, baths=baths)
 
     def energy_of_vectors(self, energy: Energy) -> Energy:
-        return flatten_site_functions(energy, (*self.lattice, 3))
+        return functions_of_flat_states(energy, (*self.lattice, 3))
 
     @property
     def heating_sites(self) -> HeatingSites:
@@ -232,7 +232,7 @@ class SpinSystem(TorqueSystem):
         turning_rate = float((np.hypot(np.ravel(spins.ratio), damping_rate) * field).max())
         diffusion = 0.0
         if boltzmann and parts is not None and parts.heating is not None:
-            temperature = np.asarray(parts.heating.values_at_sites(gradient[n:]))
+            temperature = np.asarray(parts.heating.bath_values_at_sites(gradient[n:]))
             diffusion = float((2.0 * boltzmann * np.abs(temperature) * rate).max())
         if not (turning_rate > 0.0 or diffusion > 0.0):
             raise InputError("no spin turns at this state, so any step will do. Give a state away from rest")
@@ -262,9 +262,9 @@ class SpinSystem(TorqueSystem):
         return {SPIN_LENGTHS_NAME: {f"|s|^2 / 2 at {i + 1}": HalfSquareOfSpin(i) for i in range(count)}}
 
     @property
-    def surface(self) -> Spheres:
+    def surface(self) -> SphereLengths:
         assert self._spin_structure is not None
-        return Spheres(math.prod(self.lattice), SPIN_LENGTHS_NAME, self._spin_structure.is_component_major)
+        return SphereLengths(math.prod(self.lattice), SPIN_LENGTHS_NAME, self._spin_structure.is_component_major)
 
     @property
     def _spin_structure(self) -> mf.Spins | None:
@@ -320,7 +320,10 @@ def reorder_spins(system: System) -> ReorderedSystem | None:
     count = spins.count
     planar = mf.Spins(spins.sites, 0, spins.ratio, interaction_range(system.energy, spins.sites))
     poisson = poisson_with_baths(planar, system.baths.number)
-    maps = (functools.partial(f, count=count) for f in (to_component_order, to_site_order, energy_in_component_order))
+    maps = (
+        functools.partial(f, n_spins=count)
+        for f in (spins_to_component_order, spins_to_site_order, energy_in_component_order)
+    )
     reorder, restore, pullback = maps
     functions = [pullback(f) for f in (system.energy, *system.momentum_maps.values())]
     reordered = eqx.tree_at(lambda s: [s.poisson, s.energy, *s.momentum_maps.values()], system, [poisson, *functions])

@@ -22,7 +22,7 @@ def checked_state_array(system: Any, x, batch: bool = False) -> np.ndarray | jax
         try:
             x = np.asarray(x)
         except (TypeError, ValueError) as error:
-            raise InputError(f"a state is a rectangular array of real numbers: {error}") from None
+            raise InputError(f"a state must be a rectangular array of real numbers: {error}") from None
         if x.dtype.kind not in "fiubc":
             raise InputError(f"a state must be an array of real numbers, got {x.dtype}")
     if system.space is not None and x.shape[-len(system.space.shape) :] == system.space.shape:

@@ -17,6 +17,7 @@ from manifolds._pytree_module import replace_fields
 from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..functions.time_span import is_spline, required_argument_count
 from ..tracing.interpret import MAX_UNROLLED_DIM, vanishing_entry_indices
+from ..tracing.short_form import callable_name
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import TracedFunction, trace_callables_and_result_shapes
 from .base import System
@@ -40,6 +41,11 @@ class TorqueSystem(System):
     @abstractmethod
     def torque_laws(self) -> TorqueLaws:
         """Name of what acts on the system from outside, and its laws."""
+
+    @property
+    def has_fixed_attitude(self) -> bool:
+        """True if an attitude is known at which the torque is taken: see :meth:`at_time`."""
+        return self.torque_arguments is not None and self.torque_arguments[1] is not None
 
     @property
     def is_driven(self) -> bool:
@@ -93,7 +99,7 @@ def traced_torque_and_argument_counts(
     Raises
     ------
     InputError, FunctionError
-        If it is no function of t, (t, mu), (t, mu, attitude) or (t, mu, attitude, velocity) to a dual vector; or if
+        If it is not a function of t, (t, mu), (t, mu, attitude) or (t, mu, attitude, velocity) to a dual vector; or if
         there is no attitude.
     """
     if given is None:
@@ -187,7 +193,7 @@ def torque_name(torque: Any) -> str:
     """Return the name of a torque, for messages and provenances."""
     if isinstance(torque, list | tuple):
         return " + ".join(map(torque_name, torque))
-    return getattr(torque, "__name__", type(torque).__name__)
+    return callable_name(torque)
 
 
 def _torque_terms(torque: Any) -> tuple[Callable, ...]:

@@ -20,7 +20,7 @@ from ..functions.gradients import EPS
 from ..integrators import DEFAULT_METHOD, MetriplecticTaylor, OneStepMethod
 from ..integrators.base import is_permutation_equivariant
 from ..runs.adaptive import Adaptive
-from ..systems import LiePoissonSystem, System
+from ..systems import System
 from .relation_case import RelationCase, SkipReason, state_near_initial_state
 from .run_relations import (
     check_diffrax_matches_integrate,
@@ -132,7 +132,7 @@ def why_state_is_not_a_plain_vector(case: RelationCase) -> SkipReason:
     """Return why the states of a system cannot be transformed linearly, as a text, or None if they can."""
     system = case.system
     if system.is_driven or system.space is not None or system.sites:
-        return "states are no vectors of R^n whose functions depend on them alone"
+        return "states are not vectors of R^n whose functions depend on them alone"
     return None
 
 
@@ -196,7 +196,7 @@ def _check_linear_map(case: RelationCase, description: str, matrix: np.ndarray, 
         and is_permutation_equivariant(case.method)
         and not any(isinstance(term, Pullback) for term in system.energy.terms)
     )
-    has_same_names = not isinstance(system, LiePoissonSystem)  # another basis has other Casimirs
+    has_same_names = system.lie_algebra is None  # another basis has other Casimirs
     case.compare_with_base_run(
         description,
         run,

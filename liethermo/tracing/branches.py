@@ -1,7 +1,7 @@
 """Move the instructions that only one side of a branch needs into that side, so that they can be jumped over.
 
 A scalar program computes both sides of every ``lax.cond`` and then selects one, which is right wherever it runs. The
-writer of machine code calls :func:`instructions_in_branches` to move the instructions of one side behind a jump.
+writer of machine code calls :func:`sink_instructions_into_branches` to move the instructions of one side behind a jump.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Guard: TypeAlias = tuple[tuple[str, bool], ...]
 
 
 class Branch(NamedTuple):
-    """A choice between two sides.
+    """A branch of a program: its condition, the instructions of both sides, and the selections between them.
 
     Attributes
     ----------
@@ -44,8 +44,10 @@ class Branch(NamedTuple):
     choices: list[Instruction]
 
 
-def instructions_in_branches(program: Program, min_side_cost: int = MIN_BRANCH_COST) -> list[Instruction | Branch]:
-    """Return the instructions in order of evaluation; those that only one side of a branch needs are moved into it.
+def sink_instructions_into_branches(
+    program: Program, min_side_cost: int = MIN_BRANCH_COST
+) -> list[Instruction | Branch]:
+    """Move the instructions that only one side of a branch needs into that side; return all in order of evaluation.
 
     Parameters
     ----------
@@ -56,7 +58,7 @@ def instructions_in_branches(program: Program, min_side_cost: int = MIN_BRANCH_C
     tests = {instruction.target for instruction in program.instructions if instruction.op == "branch"}
     if not tests:
         return list(program.instructions)
-    guards = _guards_by_target(program, tests)
+    guards = _enclosing_branches_by_target(program, tests)
     costs = Counter[Guard]()
     for instruction in program.instructions:
         guard = guards[instruction.target]
@@ -68,11 +70,11 @@ def instructions_in_branches(program: Program, min_side_cost: int = MIN_BRANCH_C
         while guard and costs[guard] < min_side_cost:
             guard = guard[:-1]
         guards[target] = guard
-    return _order_by_dependence(program.instructions, guards, 0)
+    return _nested_topological_order(program.instructions, guards, 0)
 
 
-def _guards_by_target(program: Program, tests: set[str]) -> dict[str, Guard]:
-    """Return the guard (the branches that enclose it) of each instruction, by the name that the instruction defines.
+def _enclosing_branches_by_target(program: Program, branch_names: set[str]) -> dict[str, Guard]:
+    """Return the branches that have to enclose each instruction (its guard), by the name that the instruction defines.
 
     All ``select`` instructions of a branch stand together, so each has the common prefix of their guards. This moves
     their arguments, and with these other choices; the pass is repeated until the guards no longer change.
@@ -83,7 +85,7 @@ def _guards_by_target(program: Program, tests: set[str]) -> dict[str, Guard]:
         new_choice_guards: dict[str, Guard] = {}
         for target, op, args in reversed(program.instructions):
             guard = guards.setdefault(target, ())
-            test = args[0] if op == "select" and args[0] in tests else None
+            test = args[0] if op == "select" and args[0] in branch_names else None
             if isinstance(test, str):
                 new_choice_guards[test] = _common_prefix(new_choice_guards.get(test, guard), guard)
                 guard = guards[target] = _common_prefix(choice_guards.get(test, guard), guard)
@@ -106,10 +108,13 @@ def _common_prefix(a: Guard, b: Guard) -> Guard:
     return a[:depth]
 
 
-def _order_by_dependence(
+def _nested_topological_order(
     instructions: Sequence[Instruction], guards: dict[str, Guard], depth: int
 ) -> list[Instruction | Branch]:
-    """Order instructions that share their first ``depth`` branches, so that each follows its arguments."""
+    """Order instructions so that each follows its arguments, nested into branches below the first ``depth`` ones.
+
+    The instructions share their first ``depth`` enclosing branches.
+    """
     inner_tests = {guards[i.target][depth][0] for i in instructions if len(guards[i.target]) > depth}
     group_names: dict[str, str] = {}  # by target: the test of its branch, or the target
     groups: dict[str, list[Instruction]] = {}
@@ -134,18 +139,18 @@ def _order_by_dependence(
             else:
                 order[stack.pop()] = None
 
-    def instruction_or_branch(name: str) -> Instruction | Branch:
-        if name not in inner_tests:
-            return groups[name][0]
-        sides: dict[Guard, list[Instruction]] = {((name, True),): [], ((name, False),): [], (): []}
-        for i in groups[name]:
+    def build_instruction_or_branch(group_name: str) -> Instruction | Branch:
+        if group_name not in inner_tests:
+            return groups[group_name][0]
+        sides: dict[Guard, list[Instruction]] = {((group_name, True),): [], ((group_name, False),): [], (): []}
+        for i in groups[group_name]:
             sides[guards[i.target][depth : depth + 1]].append(i)
         true_side, false_side, common_items = sides.values()
-        test = next(i for i in common_items if i.target == name)
+        test = next(i for i in common_items if i.target == group_name)
         ordered_sides = (
-            _order_by_dependence(true_side, guards, depth + 1),
-            _order_by_dependence(false_side, guards, depth + 1),
+            _nested_topological_order(true_side, guards, depth + 1),
+            _nested_topological_order(false_side, guards, depth + 1),
         )
         return Branch(test, ordered_sides, [i for i in common_items if i is not test])
 
-    return [instruction_or_branch(name) for name in order]
+    return [build_instruction_or_branch(name) for name in order]

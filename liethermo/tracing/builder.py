@@ -26,12 +26,12 @@ class Block:
     Attributes
     ----------
     name : str
-    kinds : tuple of str
+    result_kinds : tuple of str
         Kinds of the results: ``"f"`` for a real number, ``"i"`` for an integer, ``"b"`` for a truth value.
     """
 
     name: str
-    kinds: tuple[str, ...]
+    result_kinds: tuple[str, ...]
     inner_programs: tuple = ()
     """Programs that the block runs repeatedly."""
 
@@ -40,14 +40,15 @@ class Block:
         raise NotImplementedError
 
     @functools.cached_property
-    def _text(self) -> str:
+    def _comparison_key(self) -> str:
+        """Text that two blocks share if and only if they are equal."""
         return repr(self)
 
     def __eq__(self, other) -> bool:
-        return type(self) is type(other) and self._text == other._text
+        return type(self) is type(other) and self._comparison_key == other._comparison_key
 
     def __hash__(self) -> int:
-        return hash(self._text)
+        return hash(self._comparison_key)
 
     def __str__(self) -> str:
         return self.name
@@ -156,7 +157,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = (
 
 
 def implementation(op: str | Block) -> Callable[..., Any]:
-    """Return the function that evaluates an operation or a block."""
+    """Return the Python function that evaluates an operation or a block on numbers."""
     return op if isinstance(op, Block) else OPERATIONS[op]
 
 
@@ -174,7 +175,7 @@ COMMUTATIVE = {"add", "mul", "and", "or", "xor", "eq", "ne"}
 
 
 class LimitExceededError(Exception):
-    """A program has more instructions than its builder allows."""
+    """Error that a program has more instructions than its builder allows."""
 
 
 class EnclosingScope:
@@ -182,7 +183,7 @@ class EnclosingScope:
 
     Attributes
     ----------
-    builder : Builder
+    builder : ProgramBuilder
         The builder of the outer program.
     inner_names, outer_scalars : dict
         The name that each outer scalar has inside, and the inverse of this map.
@@ -190,7 +191,7 @@ class EnclosingScope:
         The entries of each outer table, by its name inside.
     """
 
-    def __init__(self, builder: Builder):
+    def __init__(self, builder: ProgramBuilder):
         self.builder = builder
         self.inner_names: dict[Scalar, str] = {}
         self.outer_scalars: dict[Scalar, Scalar] = {}
@@ -203,51 +204,55 @@ class EnclosingScope:
             self.outer_scalars[name] = a
         return self.inner_names[a]
 
-    def table(self, entries: Sequence[Scalar]) -> str:
+    def import_table(self, entries: Sequence[Scalar]) -> str:
         """Make a table of these entries in the outer program; return the name by which the inner program reads it."""
-        name = self.import_scalar(self.builder.table([self.outer_scalars[a] if type(a) is str else a for a in entries]))
+        name = self.import_scalar(
+            self.builder.make_table([self.outer_scalars[a] if type(a) is str else a for a in entries])
+        )
         self.tables[name] = tuple(entries)
         return name
 
 
 TABLE_MARK = "table"
-"""First of the two results of :meth:`Builder.prepare_pick` that stand for a table; no scalar has this name."""
+"""First of the two results of :meth:`ProgramBuilder.prepare_pick` that stand for a table; no scalar has this name."""
 
 MAX_TABLE_STRIDE = 256
 """Largest distance in memory that is tried between the entries of a table of which only one is not fixed."""
 
 
-def restore_fixed_inputs(entries: Sequence[Scalar], fixed_inputs: Sequence[np.ndarray | None]) -> Sequence[Scalar]:
-    """Return the entries of a table, numbers replaced by names of inputs if all then are equidistant in an input array.
+def replace_constants_by_strided_inputs(
+    entries: Sequence[Scalar], fixed_inputs: Sequence[np.ndarray | None]
+) -> Sequence[Scalar]:
+    """Replace the constants of a table by names of inputs if all its entries then are equidistant in one input array.
 
-    A table of that kind is read where the array lies, without a copy. An input that is fixed to a number has this
-    number at run time too, so the names stand for equal values.
+    Such a table is read where the input array lies, without a copy; any other table is returned unchanged. An input
+    that is fixed to a number has this number at run time too, so the names stand for equal values.
     """
-    named = [(k, a) for k, a in enumerate(entries) if type(a) is str]
-    if not named or len(named) == len(entries) or not all(a[0] == "x" for _, a in named):
+    named_entries = [(k, a) for k, a in enumerate(entries) if type(a) is str]
+    if not named_entries or len(named_entries) == len(entries) or not all(a[0] == "x" for _, a in named_entries):
         return entries
-    positions = [(k, *map(int, a[1:].split("_"))) for k, a in named]
+    positions = [(k, *map(int, a[1:].split("_"))) for k, a in named_entries]
     first_index, array_index, first_position = positions[0]
-    fixed = fixed_inputs[array_index] if array_index < len(fixed_inputs) else None
-    if fixed is None or any(i != array_index for _, i, _ in positions):
+    fixed_values = fixed_inputs[array_index] if array_index < len(fixed_inputs) else None
+    if fixed_values is None or any(i != array_index for _, i, _ in positions):
         return entries
     if len(positions) > 1:
         stride, remainder = divmod(positions[1][2] - first_position, positions[1][0] - first_index)
         strides = [stride] if not remainder and stride > 0 else []
     else:
         strides = [*range(1, MAX_TABLE_STRIDE + 1)]
-    wanted = np.array([np.nan if type(a) is str else a for a in entries], dtype=np.float64)
+    table_values = np.array([np.nan if type(a) is str else a for a in entries], dtype=np.float64)
     for stride in strides:
         source = first_position + stride * (np.arange(len(entries)) - first_index)
-        if source[0] < 0 or source[-1] >= fixed.size or any(source[k] != j for k, _, j in positions):
+        if source[0] < 0 or source[-1] >= fixed_values.size or any(source[k] != j for k, _, j in positions):
             continue
-        if np.array_equal(fixed[source], wanted, equal_nan=True):
+        if np.array_equal(fixed_values[source], table_values, equal_nan=True):
             return [f"x{array_index}_{j}" for j in source]
     return entries
 
 
-class Builder:
-    """Collects instructions; each method returns the scalar that holds its result.
+class ProgramBuilder:
+    """Builds a scalar program: each method emits instructions and returns the scalar that holds their result.
 
     No instruction is emitted for a result that is known at compile time, that equals an earlier one, or that differs
     from one by a sign which a later instruction can absorb. These simplifications are exact, except for the sign of a
@@ -281,12 +286,12 @@ class Builder:
         self.call_results: dict[tuple, tuple] = {}
 
     @property
-    def real(self) -> Builder:
-        """The builder of real scalars, which is this object."""
+    def real_builder(self) -> ProgramBuilder:
+        """Builder of real scalars: this object; for a complex builder, the builder of its real and imaginary parts."""
         return self
 
     def op(self, op: str | Block, *args: Scalar) -> Any:
-        """Return the scalar that an operation results in; constants are folded, and equal expressions merged."""
+        """Emit an operation and return its result; constants are folded, and equal operations are emitted once."""
         if not any(type(a) is str for a in args):
             return evaluate_on_numbers(op, *args)
         if op in COMMUTATIVE:
@@ -294,6 +299,7 @@ class Builder:
         return self._emit(op, *args)
 
     def _emit(self, op: str | Block, *args: Scalar) -> str:
+        """Append an instruction unless an equal one exists; return the name of its result."""
         key = (op, *(a if type(a) is str else repr(a) for a in args))  # repr tells 0.0 from -0.0, 1 from True
         name = self._emitted.get(key)
         if name is None:
@@ -304,14 +310,14 @@ class Builder:
         return name
 
     def emit_block(self, block: Block, *args: Scalar) -> list[Scalar]:
-        """Return the results of a block."""
+        """Emit the instruction of a block and return the block's results."""
         result = self.op(block, *args)
         if isinstance(result, str):
-            return [self.op("item", result, i) for i in range(len(block.kinds))]
+            return [self.op("item", result, i) for i in range(len(block.result_kinds))]
         return [a.item() if isinstance(a, np.generic | np.ndarray) else a for a in result]
 
-    def table(self, entries: Sequence[Scalar]) -> str:
-        """Return one variable that holds the entries, from which a loop reads by index.
+    def make_table(self, entries: Sequence[Scalar]) -> str:
+        """Return the name of one variable that holds the entries, from which a loop reads by index.
 
         Consecutive results of one block are taken from it without a copy. Inside a loop, a table of outer scalars is
         made once, outside of the loop.
@@ -319,7 +325,7 @@ class Builder:
         if self.enclosing is not None and not any(
             type(a) is str and a not in self.enclosing.outer_scalars for a in entries
         ):
-            return self.enclosing.table(entries)
+            return self.enclosing.import_table(entries)
         first_instruction = self._defining_instruction(entries[0]) if entries else None
         if first_instruction is not None and first_instruction.op == "item":
             block_result, start = first_instruction.args[0], int(first_instruction.args[1])
@@ -327,25 +333,26 @@ class Builder:
                 self._defining_instruction(a) == (a, "item", (block_result, start + i)) for i, a in enumerate(entries)
             ):
                 return self._emit("column", block_result, start, len(entries))
-        return self._emit("table", *restore_fixed_inputs(entries, self.fixed_inputs))
+        return self._emit("table", *replace_constants_by_strided_inputs(entries, self.fixed_inputs))
 
-    def input_positions_or_none(self, entries: Sequence[Scalar]) -> list[tuple[int, int]] | None:
-        """Return the (array, entry) indices of scalars among the inputs of the outermost program.
+    def input_positions_or_none(self, scalars: Sequence[Scalar]) -> list[tuple[int, int]] | None:
+        """Return the (array, entry) indices of these scalars among the inputs of the outermost program.
 
         The result is None if a scalar is not an input.
         """
         if self.enclosing is not None:
             return self.enclosing.builder.input_positions_or_none(
-                [self.enclosing.outer_scalars.get(a, 0.0) for a in entries]
+                [self.enclosing.outer_scalars.get(a, 0.0) for a in scalars]
             )
-        if not all(type(a) is str and a[0] == "x" for a in entries):
+        if not all(type(a) is str and a[0] == "x" for a in scalars):
             return None
         return [
             (int(array_index), int(entry_index))
-            for array_index, entry_index in (str(a)[1:].split("_") for a in entries)
+            for array_index, entry_index in (str(a)[1:].split("_") for a in scalars)
         ]
 
     def _defining_instruction(self, a: Scalar) -> Instruction | None:
+        """Return the instruction that computes a scalar; None for an input or a constant."""
         return self.instructions[int(a[1:])] if type(a) is str and a[0] == "t" else None
 
     def add(self, a, b):
@@ -390,7 +397,7 @@ class Builder:
             return b
         if b == 1:
             return a
-        return self._result_with_sign_outside(self.mul, "mul", a, b)
+        return self._pull_out_signs(self.mul, "mul", a, b)
 
     def div(self, a, b):
         if type(a) is not str and type(b) is not str:
@@ -399,21 +406,21 @@ class Builder:
             return abs(a)
         if b == 1:
             return a
-        return self._result_with_sign_outside(self.div, "div", a, b)
+        return self._pull_out_signs(self.div, "div", a, b)
 
-    def _result_with_sign_outside(self, simplify, op, a, b):
-        """Return a product or quotient of two scalars, with their minus signs applied to the result."""
-        for x, result in (a, lambda y: simplify(y, b)), (b, lambda y: simplify(a, y)):
+    def _pull_out_signs(self, multiply_or_divide, op, a, b):
+        """Return a product or quotient of two scalars, with their minus signs taken out and applied to the result."""
+        for x, result in (a, lambda y: multiply_or_divide(y, b)), (b, lambda y: multiply_or_divide(a, y)):
             opposite = self._negated_operand.get(x) if type(x) is str else -x if x < 0 else None
             if opposite is not None:
                 return self.neg(result(opposite))
         return self.op(op, a, b)
 
-    def integer_pow(self, a, n: int, one: Scalar = 1.0):
+    def integer_pow(self, a, n: int, unit: Scalar = 1.0):
         """Return ``a**n`` by repeated squaring."""
         if n < 0:
-            return self.div(one, self.integer_pow(a, -n))
-        result = one
+            return self.div(unit, self.integer_pow(a, -n))
+        result = unit
         while n:
             if n & 1:
                 result = self.mul(result, a)
@@ -433,8 +440,8 @@ class Builder:
             return a if condition else b
         return a if type(a) is type(b) and repr(a) == repr(b) else self.op("select", condition, a, b)
 
-    def branch(self, condition, true_values: Sequence[Scalar], false_values: Sequence[Scalar]) -> list[Scalar]:
-        """Select the scalars of one side of a ``lax.cond``.
+    def select_side(self, condition, true_values: Sequence[Scalar], false_values: Sequence[Scalar]) -> list[Scalar]:
+        """Return the scalars of the side of a ``lax.cond`` that the condition selects.
 
         A ``branch`` instruction marks the condition, so that :mod:`.branches` finds the choices that belong together.
         """
@@ -449,18 +456,21 @@ class Builder:
         return self.pick_prepared(index, self.prepare_pick(entries))
 
     def prepare_pick(self, entries: Sequence[Scalar]) -> tuple[Scalar, ...]:
-        """Return the one entry that all entries equal, a few entries, or :data:`TABLE_MARK` and the name of a table."""
+        """Prepare entries for :meth:`pick_prepared`, so that many picks share one table.
+
+        Return one entry if all are equal, the entries if they are few, or :data:`TABLE_MARK` and the name of a table.
+        """
         if all(type(a) is type(entries[0]) and repr(a) == repr(entries[0]) for a in entries):
             return (entries[0],)
-        return tuple(entries) if len(entries) <= MAX_SELECT_ENTRIES else (TABLE_MARK, self.table(entries))
+        return tuple(entries) if len(entries) <= MAX_SELECT_ENTRIES else (TABLE_MARK, self.make_table(entries))
 
-    def pick_prepared(self, index: str, prepared: tuple[Scalar, ...]) -> Scalar:
+    def pick_prepared(self, index: str, prepared_entries: tuple[Scalar, ...]) -> Scalar:
         """Return the entry at a run-time index among entries from :meth:`prepare_pick`."""
-        if len(prepared) == 1:
-            return prepared[0]
-        if prepared[0] == TABLE_MARK:
-            return self.op("lookup", index, prepared[1])
-        return self.op("pick", index, *prepared)
+        if len(prepared_entries) == 1:
+            return prepared_entries[0]
+        if prepared_entries[0] == TABLE_MARK:
+            return self.op("lookup", index, prepared_entries[1])
+        return self.op("pick", index, *prepared_entries)
 
     def conj(self, a):
         """Return the complex conjugate of a real scalar, which is the scalar."""
@@ -525,21 +535,22 @@ def constant_array(value, dtype=None) -> np.ndarray:
 
 
 def scalar_array(scalars: Sequence[Any], shape) -> np.ndarray:
+    """Return an object array of this shape that holds the scalars in row-major order."""
     result = np.empty(len(scalars), object)
     result[:] = scalars
     return result.reshape(shape)
 
 
-def elementwise(function: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray:
-    """Apply a function entry by entry, with broadcasting."""
+def map_elementwise(function: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray:
+    """Apply a function to the entries of arrays, with broadcasting; return an object array of its results."""
     if len({np.shape(x) for x in arrays}) > 1:
         arrays = np.broadcast_arrays(*arrays)
     return scalar_array(list(map(function, *(x.ravel().tolist() for x in arrays))), arrays[0].shape)
 
 
-def rows_along_axes(x: np.ndarray, axes) -> tuple[list[list[Scalar]], tuple[int, ...]]:
+def rows_and_outer_shape(x: np.ndarray, row_axes) -> tuple[list[list[Scalar]], tuple[int, ...]]:
     """Return a list of entries along some axes for each index of the other axes, and the shape of the other axes."""
-    remaining_axes = [i for i in range(x.ndim) if i not in axes]
+    remaining_axes = [i for i in range(x.ndim) if i not in row_axes]
     shape = tuple(x.shape[i] for i in remaining_axes)
-    n_entries = math.prod(x.shape[i] for i in axes)
-    return x.transpose(*remaining_axes, *axes).reshape(math.prod(shape), n_entries).tolist(), shape
+    n_entries = math.prod(x.shape[i] for i in row_axes)
+    return x.transpose(*remaining_axes, *row_axes).reshape(math.prod(shape), n_entries).tolist(), shape

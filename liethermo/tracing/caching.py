@@ -77,7 +77,7 @@ def memoize(function: Callable[..., Result]) -> Callable[..., Result]:
     identity_cache: LRUCache[tuple[tuple, Result]] = LRUCache(MAX_CACHED_RESULTS, MAX_CACHED_BYTES)
     content_cache: LRUCache[Result] = LRUCache(MAX_CACHED_RESULTS, MAX_CACHED_BYTES)
 
-    def get_or_compute_by_content(arguments: tuple, contents: tuple[_Content, ...], n_bytes: int) -> Result:
+    def get_or_compute_by_content(arguments: tuple, contents: tuple[_ArgumentContent, ...], n_bytes: int) -> Result:
         compute, keys = functools.partial(function, *arguments), tuple(content.key for content in contents)
         if n_bytes > MAX_COMPARED_BYTES or None in keys:
             return compute()
@@ -88,7 +88,7 @@ def memoize(function: Callable[..., Result]) -> Callable[..., Result]:
         entry = identity_cache.get(identities := tuple(map(id, arguments)))
         if entry is not None:
             return entry[1]
-        contents = tuple(map(_content_of, arguments))
+        contents = tuple(map(_cached_content, arguments))
         if any(content.is_changeable for content in contents):
             return function(*arguments)
         n_bytes = sum(content.n_bytes for content in contents)
@@ -100,8 +100,8 @@ def memoize(function: Callable[..., Result]) -> Callable[..., Result]:
     return call
 
 
-class _Content(NamedTuple):
-    """Content of an argument of a cached function.
+class _ArgumentContent(NamedTuple):
+    """Key and size of an argument of a cached function, for a lookup by its content.
 
     Attributes
     ----------
@@ -118,19 +118,21 @@ class _Content(NamedTuple):
     is_changeable: bool
 
 
-_content_cache: LRUCache[tuple[Any, _Content]] = LRUCache(MAX_CACHED_RESULTS, MAX_CACHED_BYTES)
+_content_cache: LRUCache[tuple[Any, _ArgumentContent]] = LRUCache(MAX_CACHED_RESULTS, MAX_CACHED_BYTES)
 
 
-def _content_of(argument: Any) -> _Content:
-    """Return the content of an argument, cached by its identity."""
+def _cached_content(argument: Any) -> _ArgumentContent:
+    """Return the key and size of an argument's content, cached by the identity of the argument."""
     entry = _content_cache.get(id(argument))
     if entry is not None:
         return entry[1]
     leaves = jax.tree_util.tree_leaves(argument)
     if any(isinstance(leaf, np.ndarray | jax.core.Tracer) for leaf in leaves):
-        return _Content(None, 0, is_changeable=True)
+        return _ArgumentContent(None, 0, is_changeable=True)
     n_bytes = sum(leaf.nbytes for leaf in leaves if eqx.is_array(leaf))
-    content = _Content(fingerprint(argument) if n_bytes <= MAX_COMPARED_BYTES else None, n_bytes, is_changeable=False)
+    content = _ArgumentContent(
+        fingerprint(argument) if n_bytes <= MAX_COMPARED_BYTES else None, n_bytes, is_changeable=False
+    )
     # the entry holds the argument, so that no other object takes its id
     return _content_cache.get_or_compute(id(argument), lambda: (argument, content), n_bytes)[1]
 

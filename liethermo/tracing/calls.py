@@ -16,8 +16,9 @@ from .builder import Block
 
 @dataclass(frozen=True, eq=False)
 class LapackCall(Block):
-    """A function of matrices, passed row by row; complex ones pass all real parts, then all imaginary parts.
+    """A block that calls a LAPACK function of matrices.
 
+    Matrices are passed row by row; complex ones pass all real parts, then all imaginary parts.
     The results are NaN if an argument is not finite or the function does not converge.
 
     Attributes
@@ -34,8 +35,8 @@ class LapackCall(Block):
     is_complex: bool = False
 
     @property
-    def kinds(self) -> tuple[str, ...]:  # type: ignore[override]
-        return ("f",) * sum(self.entry_counts(self.result_specs))
+    def result_kinds(self) -> tuple[str, ...]:  # type: ignore[override]
+        return ("f",) * sum(self.real_entry_counts(self.result_specs))
 
     @property
     def argument_shapes(self) -> list[tuple[int, ...]]:
@@ -47,33 +48,33 @@ class LapackCall(Block):
         """Return the shape of each result, and whether it is real even for complex arguments."""
         return LAPACK_FUNCTIONS[self.name].result_specs(*self.sizes)
 
-    def entry_counts(self, specs) -> list[int]:
-        """Return the number of real entries of each result."""
-        return [math.prod(shape) * (2 if self.is_complex and not is_real else 1) for shape, is_real in specs]
+    def real_entry_counts(self, result_specs) -> list[int]:
+        """Return the number of real entries of each result; a complex entry counts twice."""
+        return [math.prod(shape) * (2 if self.is_complex and not is_real else 1) for shape, is_real in result_specs]
 
     def __call__(self, *args) -> list:
         arrays = np.broadcast_arrays(*(np.asarray(a, dtype=np.float64) for a in args))
         batch_shape = arrays[0].shape
         rows = np.stack(arrays, axis=-1).reshape(-1, len(args))
-        results = np.stack([self._evaluate_one(row) for row in rows]).reshape(*batch_shape, -1)
+        results = np.stack([self._evaluate_flat_arguments(row) for row in rows]).reshape(*batch_shape, -1)
         return [results[..., i][()] for i in range(results.shape[-1])]
 
-    def _evaluate_one(self, row: np.ndarray) -> np.ndarray:
-        """Evaluate the function for one set of matrices, given as a row of real entries."""
-        if not np.isfinite(row).all():
-            return np.full(len(self.kinds), np.nan)
+    def _evaluate_flat_arguments(self, real_entries: np.ndarray) -> np.ndarray:
+        """Evaluate the function for matrices that are passed as one flat array of real entries; return flat results."""
+        if not np.isfinite(real_entries).all():
+            return np.full(len(self.result_kinds), np.nan)
         matrices, start = [], 0
         for shape in self.argument_shapes:
             n_entries = math.prod(shape)
-            matrix = row[start : start + n_entries].reshape(shape)
+            matrix = real_entries[start : start + n_entries].reshape(shape)
             if self.is_complex:
-                matrix = matrix + 1j * row[start + n_entries : start + 2 * n_entries].reshape(shape)
+                matrix = matrix + 1j * real_entries[start + n_entries : start + 2 * n_entries].reshape(shape)
             matrices.append(matrix)
             start += n_entries * (2 if self.is_complex else 1)
         try:
             results = LAPACK_FUNCTIONS[self.name].evaluate(self.sizes, *matrices)
         except np.linalg.LinAlgError:
-            return np.full(len(self.kinds), np.nan)
+            return np.full(len(self.result_kinds), np.nan)
         components = []
         for x, (_, is_real) in zip(results, self.result_specs, strict=True):
             components += [x.real.ravel(), x.imag.ravel()] if self.is_complex and not is_real else [np.real(x).ravel()]
@@ -82,7 +83,7 @@ class LapackCall(Block):
 
 @dataclass(frozen=True, eq=False)
 class MatrixProduct(Block):
-    """The product of two real matrices, as a loop; its arguments are two tables.
+    """A block that multiplies two real matrices in a loop; its arguments are two tables.
 
     Attributes
     ----------
@@ -97,7 +98,7 @@ class MatrixProduct(Block):
     name: str = "product"
 
     @property
-    def kinds(self) -> tuple[str, ...]:  # type: ignore[override]
+    def result_kinds(self) -> tuple[str, ...]:  # type: ignore[override]
         return ("f",) * (self.sizes[0] * self.sizes[2])
 
     def __call__(self, *args) -> list:
@@ -114,19 +115,19 @@ class MatrixProduct(Block):
 
 @dataclass(frozen=True, eq=False)
 class DeferredBlock(Block):
-    """A block that the writer of the code fills in; evaluated as it stands, it returns its first arguments.
+    """A placeholder block that the writer of machine code fills in; evaluated by NumPy, it returns its first arguments.
 
     Attributes
     ----------
-    kinds : tuple of str
+    result_kinds : tuple of str
         Kinds of the results, and of the first arguments.
     """
 
-    kinds: tuple[str, ...]
+    result_kinds: tuple[str, ...]
     name: str = "deferred"
 
     def __call__(self, *args) -> list:
-        return list(args[: len(self.kinds)])
+        return list(args[: len(self.result_kinds)])
 
 
 deferred_p = Primitive("deferred")
@@ -137,7 +138,7 @@ deferred_p.def_abstract_eval(lambda *avals, results: list(avals[:results]))
 
 @dataclass(frozen=True)
 class LapackFunction:
-    """Shapes and implementation of a function that :class:`LapackCall` calls.
+    """Argument shapes, result shapes and implementation of a function that :class:`LapackCall` calls.
 
     Attributes
     ----------
@@ -151,20 +152,23 @@ class LapackFunction:
     evaluate: Callable[..., Any]
 
 
-def _lu(sizes, a) -> tuple[np.ndarray, np.ndarray]:
-    (getrf,) = scipy.linalg.get_lapack_funcs(("getrf",), (a,))
-    factors, pivots, _ = getrf(a)
+def _lu_factors_and_pivots(sizes, matrix) -> tuple[np.ndarray, np.ndarray]:
+    """Return both LU factors in one matrix, and the row with which each row is exchanged."""
+    (getrf,) = scipy.linalg.get_lapack_funcs(("getrf",), (matrix,))
+    factors, pivots, _ = getrf(matrix)
     return factors, pivots.astype(np.float64)
 
 
-def _qr(sizes, a) -> tuple[np.ndarray, np.ndarray]:
+def _qr_factors(sizes, matrix) -> tuple[np.ndarray, np.ndarray]:
+    """Return the factors Q and R, with as many columns of Q as ``sizes`` asks for."""
     columns = sizes[2]
-    q, r = scipy.linalg.qr(a, mode="full" if columns == sizes[0] else "economic")
+    q, r = scipy.linalg.qr(matrix, mode="full" if columns == sizes[0] else "economic")
     return q, r[: sizes[0] if columns == sizes[0] else columns]
 
 
-def _svd(sizes, a) -> tuple[np.ndarray, ...]:
-    u, s, v = scipy.linalg.svd(a, full_matrices=bool(sizes[2]), lapack_driver="gesdd")
+def _singular_values_and_vectors(sizes, matrix) -> tuple[np.ndarray, ...]:
+    """Return singular values, left singular vectors as columns, and right ones as rows."""
+    u, s, v = scipy.linalg.svd(matrix, full_matrices=bool(sizes[2]), lapack_driver="gesdd")
     return s, u, v
 
 
@@ -180,13 +184,15 @@ LAPACK_FUNCTIONS = {
         lambda sizes, a: scipy.linalg.eigh(a, driver="evd")[::-1],
     ),
     "inverse": LapackFunction(lambda n: [(n, n)], lambda n: [((n, n), False)], lambda sizes, a: [np.linalg.inv(a)]),
-    "lu": LapackFunction(lambda m, n: [(m, n)], lambda m, n: [((m, n), False), ((min(m, n),), True)], _lu),
+    "lu": LapackFunction(
+        lambda m, n: [(m, n)], lambda m, n: [((m, n), False), ((min(m, n),), True)], _lu_factors_and_pivots
+    ),
     "qr": LapackFunction(
         lambda m, n, columns: [(m, n)],
         lambda m, n, columns: [((m, columns), False), ((columns, n), False)],
-        _qr,
+        _qr_factors,
     ),
-    "svd": LapackFunction(lambda m, n, full: [(m, n)], _svd_result_specs, _svd),
+    "svd": LapackFunction(lambda m, n, full: [(m, n)], _svd_result_specs, _singular_values_and_vectors),
 }
 """Functions of matrices, by name.
 

@@ -8,7 +8,7 @@ from functools import reduce
 
 import numpy as np
 
-from .builder import Builder, ComplexPair, Scalar, as_complex_pair, scalar_array
+from .builder import ComplexPair, ProgramBuilder, Scalar, as_complex_pair, scalar_array
 
 
 def flatten_scalars(arrays: Sequence[np.ndarray]) -> list[Scalar]:
@@ -30,8 +30,8 @@ def unflatten_scalars(scalars: Iterator[Scalar], avals: Sequence) -> list[np.nda
     return arrays
 
 
-def scalar_kinds(avals: Sequence) -> tuple[str, ...]:
-    """Return the kinds of the real scalars of arrays with these types: see :attr:`.builder.Block.kinds`."""
+def real_scalar_kinds(avals: Sequence) -> tuple[str, ...]:
+    """Return the kind of each real scalar of arrays with these avals, ``"f"``, ``"i"`` or ``"b"``, in one tuple."""
     return tuple(
         kind
         for aval in avals
@@ -43,32 +43,32 @@ def scalar_kinds(avals: Sequence) -> tuple[str, ...]:
 class ComplexBuilder:
     """A builder of complex arithmetic, which calls a real builder for the real and imaginary parts."""
 
-    def __init__(self, real: Builder):
-        self.real, self.max_instructions = real, real.max_instructions
+    def __init__(self, real_builder: ProgramBuilder):
+        self.real_builder, self.max_instructions = real_builder, real_builder.max_instructions
 
     def add(self, a, b):
-        a, b, r = as_complex_pair(a), as_complex_pair(b), self.real
+        a, b, r = as_complex_pair(a), as_complex_pair(b), self.real_builder
         return ComplexPair(r.add(a.re, b.re), r.add(a.im, b.im))
 
     def sub(self, a, b):
-        a, b, r = as_complex_pair(a), as_complex_pair(b), self.real
+        a, b, r = as_complex_pair(a), as_complex_pair(b), self.real_builder
         return ComplexPair(r.sub(a.re, b.re), r.sub(a.im, b.im))
 
     def neg(self, a):
-        a, r = as_complex_pair(a), self.real
+        a, r = as_complex_pair(a), self.real_builder
         return ComplexPair(r.neg(a.re), r.neg(a.im))
 
     def mul(self, a, b):
-        a, b, r = as_complex_pair(a), as_complex_pair(b), self.real
+        a, b, r = as_complex_pair(a), as_complex_pair(b), self.real_builder
         return ComplexPair(r.sub(r.mul(a.re, b.re), r.mul(a.im, b.im)), r.add(r.mul(a.re, b.im), r.mul(a.im, b.re)))
 
     def conj(self, a):
         a = as_complex_pair(a)
-        return ComplexPair(a.re, self.real.neg(a.im))
+        return ComplexPair(a.re, self.real_builder.neg(a.im))
 
     def div(self, a, b):
         """Return a / b, with b scaled so that ``|b|^2`` neither overflows nor underflows; a / infinity is zero."""
-        a, b, r = as_complex_pair(a), as_complex_pair(b), self.real
+        a, b, r = as_complex_pair(a), as_complex_pair(b), self.real_builder
         if type(b.im) is not str and b.im == 0:
             return ComplexPair(r.div(a.re, b.re), r.div(a.im, b.re))
         scale = r.max(r.op("abs", b.re), r.op("abs", b.im))
@@ -81,20 +81,20 @@ class ComplexBuilder:
             *(r.select(is_infinite, zero, r.div(component, square)) for component in (numerator.re, numerator.im))
         )
 
-    def integer_pow(self, a, n: int, one=1.0):
+    def integer_pow(self, a, n: int, unit=1.0):
         if n < 0:
-            return self.div(one, self.integer_pow(a, -n))
-        return reduce(self.mul, [a] * n, as_complex_pair(one))
+            return self.div(unit, self.integer_pow(a, -n))
+        return reduce(self.mul, [a] * n, as_complex_pair(unit))
 
     def pow(self, a, b):
         return self.op("exp", self.mul(b, self.op("log", a)))
 
     def select(self, condition, a, b):
-        a, b, r = as_complex_pair(a), as_complex_pair(b), self.real
+        a, b, r = as_complex_pair(a), as_complex_pair(b), self.real_builder
         return ComplexPair(r.select(condition, a.re, b.re), r.select(condition, a.im, b.im))
 
     def pick(self, index, entries):
-        pairs, r = [as_complex_pair(a) for a in entries], self.real
+        pairs, r = [as_complex_pair(a) for a in entries], self.real_builder
         return ComplexPair(r.pick(index, [a.re for a in pairs]), r.pick(index, [a.im for a in pairs]))
 
     def logistic(self, a):
@@ -102,14 +102,14 @@ class ComplexBuilder:
 
     def modulus(self, a) -> Scalar:
         """Return ``|a|``, without overflow."""
-        a, r = as_complex_pair(a), self.real
+        a, r = as_complex_pair(a), self.real_builder
         x, y = r.op("abs", a.re), r.op("abs", a.im)
         maximum, minimum = r.max(x, y), r.min(x, y)
         ratio = r.div(minimum, r.select(r.op("gt", maximum, 0.0), maximum, 1.0))
         return r.mul(maximum, r.op("sqrt", r.add(1.0, r.mul(ratio, ratio))))
 
     def op(self, op: str, *args):
-        r = self.real
+        r = self.real_builder
         if op in ("le", "lt", "ge", "gt") or op not in COMPLEX_OPERATIONS:  # operations on real numbers
             if any(isinstance(a, ComplexPair) for a in args):
                 raise NotImplementedError("on complex numbers")
@@ -120,27 +120,31 @@ class ComplexBuilder:
         return self.modulus(a)
 
     def _eq(self, a, b):
-        return self.real.op("and", self.real.op("eq", a.re, b.re), self.real.op("eq", a.im, b.im))
+        return self.real_builder.op(
+            "and", self.real_builder.op("eq", a.re, b.re), self.real_builder.op("eq", a.im, b.im)
+        )
 
     def _ne(self, a, b):
-        return self.real.op("or", self.real.op("ne", a.re, b.re), self.real.op("ne", a.im, b.im))
+        return self.real_builder.op(
+            "or", self.real_builder.op("ne", a.re, b.re), self.real_builder.op("ne", a.im, b.im)
+        )
 
     def _sign(self, a):
-        r, modulus = self.real, self.modulus(a)
+        r, modulus = self.real_builder, self.modulus(a)
         return self.div(a, r.select(r.op("eq", modulus, 0.0), 1.0, modulus))
 
-    def _polar(self, modulus, angle):
-        r = self.real
+    def _complex_from_polar(self, modulus, angle):
+        r = self.real_builder
         return ComplexPair(r.mul(modulus, r.op("cos", angle)), r.mul(modulus, r.op("sin", angle)))
 
     def _exp(self, a):
-        return self._polar(self.real.op("exp", a.re), a.im)
+        return self._complex_from_polar(self.real_builder.op("exp", a.re), a.im)
 
     def _log(self, a):
-        return ComplexPair(self.real.op("log", self.modulus(a)), self.real.op("atan2", a.im, a.re))
+        return ComplexPair(self.real_builder.op("log", self.modulus(a)), self.real_builder.op("atan2", a.im, a.re))
 
     def _log1p(self, a):
-        r = self.real
+        r = self.real_builder
         square = r.add(r.mul(a.re, r.add(2.0, a.re)), r.mul(a.im, a.im))  # |1 + a|^2 - 1, which may overflow
         modulus = self.modulus(ComplexPair(r.add(1.0, a.re), a.im))
         log_near_one = r.mul(0.5, r.op("log1p", square))
@@ -148,14 +152,14 @@ class ComplexBuilder:
         return ComplexPair(real, r.op("atan2", a.im, r.add(1.0, a.re)))
 
     def _expm1(self, a):
-        r = self.real
+        r = self.real_builder
         real_expm1, sin_half = r.op("expm1", a.re), r.op("sin", r.mul(0.5, a.im))
         cos_minus_one = r.mul(-2.0, r.mul(sin_half, sin_half))
         real = r.add(r.add(real_expm1, cos_minus_one), r.mul(real_expm1, cos_minus_one))
         return ComplexPair(real, r.mul(r.op("exp", a.re), r.op("sin", a.im)))
 
     def _sqrt(self, a):
-        r = self.real
+        r = self.real_builder
         root = r.op("sqrt", r.mul(0.5, r.add(r.op("abs", a.re), self.modulus(a))))
         zero = r.op("eq", root, 0.0)
         quotient = r.div(r.op("abs", a.im), r.select(zero, 1.0, r.mul(2.0, root)))
@@ -167,32 +171,32 @@ class ComplexBuilder:
         )
 
     def _sin(self, a):
-        r = self.real
+        r = self.real_builder
         return ComplexPair(
             r.mul(r.op("sin", a.re), r.op("cosh", a.im)),
             r.mul(r.op("cos", a.re), r.op("sinh", a.im)),
         )
 
     def _cos(self, a):
-        r = self.real
+        r = self.real_builder
         return ComplexPair(
             r.mul(r.op("cos", a.re), r.op("cosh", a.im)),
             r.neg(r.mul(r.op("sin", a.re), r.op("sinh", a.im))),
         )
 
-    def _apply_rotated(self, function, a):
-        """Return ``-i f(i a)``."""
-        result = function(ComplexPair(self.real.neg(a.im), a.re))
-        return ComplexPair(result.im, self.real.neg(result.re))
+    def _minus_i_f_of_i_a(self, function, a):
+        """Return ``-i f(i a)`` of a complex number, which gives sinh from sin, and tan from tanh."""
+        result = function(ComplexPair(self.real_builder.neg(a.im), a.re))
+        return ComplexPair(result.im, self.real_builder.neg(result.re))
 
     def _sinh(self, a):
-        return self._apply_rotated(self._sin, a)
+        return self._minus_i_f_of_i_a(self._sin, a)
 
     def _cosh(self, a):
-        return self._cos(ComplexPair(self.real.neg(a.im), a.re))
+        return self._cos(ComplexPair(self.real_builder.neg(a.im), a.re))
 
     def _tanh(self, a):
-        r = self.real
+        r = self.real_builder
         s, t = r.op("tanh", a.re), r.op("tan", a.im)
         ss, tt = r.mul(s, s), r.mul(t, t)
         denominator = r.add(1.0, r.mul(ss, tt))
@@ -202,7 +206,7 @@ class ComplexBuilder:
         )
 
     def _tan(self, a):
-        return self._apply_rotated(self._tanh, a)
+        return self._minus_i_f_of_i_a(self._tanh, a)
 
 
 COMPLEX_OPERATIONS = frozenset("abs eq ne sign exp log log1p expm1 sqrt sin cos sinh cosh tanh tan".split())

@@ -1,7 +1,7 @@
-"""Detection of constant indices out of range, with which JAX goes on silently.
+"""Detection of constant indices out of range, which JAX does not report.
 
-Of three components ``m[3]`` reads ``m[2]``, ``m.at[3].set(0.0)`` changes nothing, and ``jnp.take(m, 3)`` is NaN. The
-indices are found in a jaxpr before anything is computed. An access that states how it treats an index out of range,
+If m has three components, ``m[3]`` reads ``m[2]``, ``m.at[3].set(0.0)`` changes nothing, and ``jnp.take(m, 3)`` is NaN.
+The indices are found in a jaxpr before anything is computed. An access that states how it treats an index out of range,
 such as ``x.at[3].get(mode="fill")``, ``mode="clip"`` or ``mode="drop"``, is not checked, nor are computed indices.
 """
 
@@ -83,10 +83,10 @@ def checked_result_shapes(function: Callable, *arguments) -> Any:
 def _check_and_evaluate_indices(
     jaxpr: Jaxpr, consts: Sequence, arguments: Sequence, table_errors: list[IndexOutOfRangeError], caller: Any = None
 ) -> list:
-    """Check a jaxpr; return the constant integers among its results as arrays, None for each other result.
+    """Check the indices in a jaxpr; return the results that are constant integers as arrays, None for the others.
 
-    The arguments have the form of the results. A single wrong index raises an error, and so does a wrong index in a
-    table of entries to be written; the error of a wrong index in a table of entries to be read is appended to
+    The arguments are constant integers or None too. A single wrong index raises an error, and so does a wrong index in
+    a table of entries to be written; the error of a wrong index in a table of entries to be read is appended to
     ``table_errors``. ``caller`` is the equation that calls the jaxpr, if the jaxpr belongs to a function of JAX: JAX
     keeps the jaxprs of its own functions, with the lines of the user's code that called them first.
     """
@@ -102,7 +102,7 @@ def _check_and_evaluate_indices(
         if name in INDEX_ACCESSES:
             for index, axis_length in _invalid_indices(eqn, values, caller or eqn):
                 error = IndexOutOfRangeError(
-                    index, axis_length, user_source_line(caller or eqn), access=_kind_of_access(eqn)
+                    index, axis_length, user_source_line(caller or eqn), access=_access_kind(eqn)
                 )
                 if name != "gather" or eqn.invars[1].aval.size == eqn.invars[1].aval.shape[-1]:
                     raise error
@@ -143,7 +143,7 @@ def _calls_function_of_jax(eqn) -> bool:
     return filename is not None and not is_user_file(Path(filename))
 
 
-def _kind_of_access(eqn) -> str:
+def _access_kind(eqn) -> str:
     """Return "read" or "write" for an access that moves an index out of range, "fill" or "drop" if it skips it."""
     reads = eqn.primitive.name in ("gather", "dynamic_slice")
     if eqn.params.get("mode") == ScatterMode.FILL_OR_DROP:
@@ -181,6 +181,7 @@ TEST_RANGES = ((1.0, 0.5), (0.1, 0.1), (0.0, 0.01), (3.0, 1.0), (30.0, 10.0))
 
 
 def _has_nan(results: Sequence) -> bool:
+    """Return whether an array of real or complex numbers among the results has a NaN entry."""
     return any(bool(jnp.isnan(a).any()) for a in results if jnp.issubdtype(a.dtype, jnp.inexact))
 
 
@@ -200,7 +201,7 @@ def _evaluate_with_fill_value(jaxpr: Jaxpr, consts: Sequence, arguments: Sequenc
             params = eqn.params
             if (
                 name == "gather"
-                and (is_silently_clamped(eqn) or _reads_nan(eqn))
+                and (is_silently_clamped(eqn) or _gather_fills_with_nan(eqn))
                 and jnp.issubdtype(eqn.invars[0].aval.dtype, jnp.inexact)
             ):
                 params = params | {"mode": ScatterMode.FILL_OR_DROP, "fill_value": fill_value}
@@ -221,7 +222,7 @@ def _invalid_indices(eqn, constant_inputs: Sequence, call: Any) -> Iterator[tupl
 
     ``call`` is the equation whose traceback has the user's call.
     """
-    if eqn.params.get("mode") == ScatterMode.FILL_OR_DROP and not _omits_mode(call):
+    if eqn.params.get("mode") == ScatterMode.FILL_OR_DROP and not _user_call_omits_mode(call):
         return
     for axis, starts, window in INDEX_ACCESSES[eqn.primitive.name](eqn, constant_inputs):
         axis_length = eqn.invars[0].aval.shape[axis]
@@ -233,14 +234,17 @@ def _invalid_indices(eqn, constant_inputs: Sequence, call: Any) -> Iterator[tupl
 
 
 def _dynamic_slice_accesses(eqn, constant_inputs):
+    """Yield (axis, start of window, length of window) for each constant index of a ``dynamic_slice``."""
     yield from _slice_accesses(constant_inputs[1:], eqn.params["slice_sizes"])
 
 
 def _dynamic_update_accesses(eqn, constant_inputs):
+    """Yield (axis, start of window, length of window) for each constant index of a ``dynamic_update_slice``."""
     yield from _slice_accesses(constant_inputs[2:], eqn.invars[1].aval.shape)
 
 
 def _slice_accesses(starts, window_lengths):
+    """Yield (axis, start of window, length of window) for each axis whose start is constant."""
     yield from ((axis, s, w) for axis, (s, w) in enumerate(zip(starts, window_lengths, strict=True)) if s is not None)
 
 
@@ -254,13 +258,13 @@ def is_silently_clamped(eqn) -> bool:
     return mode == ScatterMode.PROMISE_IN_BOUNDS or (mode == ScatterMode.CLIP and not dropped_axes)
 
 
-def _reads_nan(eqn) -> bool:
+def _gather_fills_with_nan(eqn) -> bool:
     """Return whether a gather reads NaN at an index out of range."""
     fill_value = eqn.params.get("fill_value")
     return eqn.params["mode"] == ScatterMode.FILL_OR_DROP and (fill_value is None or bool(np.isnan(fill_value)))
 
 
-def _omits_mode(eqn) -> bool:
+def _user_call_omits_mode(eqn) -> bool:
     """Return whether the user's call of a function with an argument ``mode`` leaves this argument out.
 
     In a jaxpr, ``x.at[3].set(0.0)`` and ``x.at[3].set(0.0, mode="drop")`` are the same, so the names of the arguments
@@ -272,7 +276,7 @@ def _omits_mode(eqn) -> bool:
     called_function = eqn.params.get("name")  # of a function that is jitted: no frame of its own is on the stack
     for code, offset in zip(*traceback.raw_frames(), strict=True):
         if is_user_file(Path(code.co_filename)):
-            keywords = _keywords_of_call(code, offset)
+            keywords = _keyword_names_of_call(code, offset)
             return called_function in MODE_ARGUMENT_FUNCTIONS and keywords is not None and "mode" not in keywords
         if not set(Path(code.co_filename).parts) & _JAX_MACHINERY:
             called_function = code.co_name
@@ -283,7 +287,7 @@ _JAX_MACHINERY = {"interpreters", "core.py", "source_info_util.py", "pjit.py", "
 """Files and folders of JAX whose functions stand between a public function and the operations that it traces."""
 
 
-def _keywords_of_call(code: CodeType, offset: int) -> tuple[str, ...] | None:
+def _keyword_names_of_call(code: CodeType, bytecode_offset: int) -> tuple[str, ...] | None:
     """Return the names of the keyword arguments of the call at an offset of the bytecode; None for ``**options``.
 
     The offset may lie behind that of the call, in the space that Python reserves for its cache.
@@ -292,7 +296,7 @@ def _keywords_of_call(code: CodeType, offset: int) -> tuple[str, ...] | None:
     last_constant: Any = ()
     call, keywords_of_call = "", keywords
     for instruction in dis.get_instructions(code):
-        if instruction.offset > offset:
+        if instruction.offset > bytecode_offset:
             break
         call, keywords_of_call = instruction.opname, keywords
         if call == "LOAD_CONST":
@@ -307,13 +311,15 @@ def _keywords_of_call(code: CodeType, offset: int) -> tuple[str, ...] | None:
 
 
 def _gather_accesses(eqn, constant_inputs):
-    if is_silently_clamped(eqn) or _reads_nan(eqn):
+    """Yield (axis, starts of windows, length of window) for each indexed axis of a gather with constant indices."""
+    if is_silently_clamped(eqn) or _gather_fills_with_nan(eqn):
         yield from _accesses_by_axis(
             constant_inputs[1], eqn.params["dimension_numbers"].start_index_map, eqn.params["slice_sizes"]
         )
 
 
 def _scatter_accesses(eqn, constant_inputs):
+    """Yield (axis, starts of windows, length of window) for each indexed axis of a scatter with constant indices."""
     numbers = eqn.params["dimension_numbers"]
     if is_silently_clamped(eqn) or eqn.params["mode"] == ScatterMode.FILL_OR_DROP:
         unit_axes = {*numbers.inserted_window_dims, *numbers.operand_batching_dims}
@@ -323,6 +329,7 @@ def _scatter_accesses(eqn, constant_inputs):
 
 
 def _accesses_by_axis(indices, axes, window_lengths):
+    """Yield (axis, starts of windows, length of window) for each column of ``indices``; none if they are None."""
     if indices is not None and indices.size:
         yield from ((int(axis), indices[..., i], int(window_lengths[axis])) for i, axis in enumerate(axes))
 

@@ -24,7 +24,7 @@ from .index_check import check_indices
 from .programs import jit_unoptimised
 from .scalarize import UnsupportedPrimitive, scalarize
 from .searches import count_dense_operations
-from .traced import has_plain_functions, is_library_object, trace_callables
+from .traced import has_plain_functions_or_floats, is_library_object, trace_callables
 
 DEGREE_PRESERVING = frozenset(
     "add sub add_any neg copy reshape transpose squeeze broadcast_in_dim rev slice concatenate pad reduce_sum cumsum "
@@ -42,7 +42,7 @@ CALL_PRIMITIVES = frozenset(["jit", "pjit", "closed_call", "core_call", "checkpo
 """Primitives that call a jaxpr."""
 
 
-def array_degree_bound(closed_jaxpr: ClosedJaxpr, input_index: int) -> float:
+def jaxpr_degree_bound(closed_jaxpr: ClosedJaxpr, input_index: int) -> float:
     """Return an upper bound of the degree of the outputs as polynomials in one of the inputs, or infinity.
 
     All entries of an array share the largest degree among them, so the cost does not depend on the size of arrays.
@@ -109,7 +109,7 @@ MAX_UNROLLED_DIM = 2_000
 """Largest dimension of points at which a function is unrolled; for more it is compiled and mapped over the points."""
 
 MAX_DEGREE_INSTRUCTIONS = 8_000
-"""Largest number of instructions unrolled to find a degree; then :func:`array_degree_bound` gives a looser bound."""
+"""Largest number of instructions unrolled to find a degree; then :func:`jaxpr_degree_bound` gives a looser bound."""
 
 
 def evaluate_at_points(function: Callable, pytree: Any, points: np.ndarray) -> Any:
@@ -122,21 +122,21 @@ def evaluate_at_points(function: Callable, pytree: Any, points: np.ndarray) -> A
     pytree : pytree
     points : array, shape (m, n)
     """
-    return batch_evaluator(function, pytree, np.shape(points)[1])(points)
+    return make_batch_evaluator(function, pytree, np.shape(points)[1])(points)
 
 
 @memoize
-def batch_evaluator(function: Callable, pytree: Any, dim: int) -> Callable[[np.ndarray], Any]:
-    """Unroll ``function(model, x)``, and return the map from points, shape (m, dim), to its values there."""
+def make_batch_evaluator(function: Callable, pytree: Any, dim: int) -> Callable[[np.ndarray], Any]:
+    """Return a function that evaluates an unrolled ``function(pytree, x)`` for each x of points, shape (m, dim)."""
     if dim > MAX_UNROLLED_DIM:
         return lambda points: _evaluate_compiled(function, pytree, points)
-    if has_plain_functions(pytree):
+    if has_plain_functions_or_floats(pytree):
         pytree = trace_callables(pytree, function, (dim,))
     leaves, model_key, rebuild = _parameters_key_and_rebuilder(pytree)
     values = [np.asarray(leaf, dtype=np.float64) for leaf in leaves]
     zero_pattern = tuple((value == 0.0).tobytes() for value in values)  # zeros shorten the program
 
-    def unrolled_program_and_structure():
+    def unroll_program_and_structure():
         shapes = [jax.ShapeDtypeStruct(value.shape, np.float64) for value in values]
         closed_jaxpr, result_shapes = jax.make_jaxpr(lambda arrays, x: function(rebuild(arrays), x), return_shape=True)(
             shapes, jax.ShapeDtypeStruct((dim,), np.float64)
@@ -151,7 +151,7 @@ def batch_evaluator(function: Callable, pytree: Any, dim: int) -> Callable[[np.n
         ), jax.tree_util.tree_structure(result_shapes)
 
     program_and_structure = _cached_result_or_none(
-        "program", (function, model_key, zero_pattern, dim), unrolled_program_and_structure
+        "program", (function, model_key, zero_pattern, dim), unroll_program_and_structure
     )
     if program_and_structure is None:
         return lambda points: _evaluate_compiled(function, pytree, points)
@@ -181,7 +181,7 @@ def polynomial_degree_bound(function: Callable, pytree: Any, dim: int) -> float:
     """
     leaves, model_key, rebuild = _parameters_key_and_rebuilder(pytree)
 
-    def degree() -> float:
+    def compute_degree() -> float:
         shapes = [jax.ShapeDtypeStruct(np.shape(leaf), np.float64) for leaf in leaves]
         closed_jaxpr = jax.make_jaxpr(lambda arrays, x: function(rebuild(arrays), x))(
             shapes, jax.ShapeDtypeStruct((dim,), np.float64)
@@ -190,11 +190,11 @@ def polynomial_degree_bound(function: Callable, pytree: Any, dim: int) -> float:
             return math.inf  # the function closes over a tracer
         with jax.ensure_compile_time_eval():  # another function may be being traced
             try:
-                return scalarize(closed_jaxpr, max_instructions=MAX_DEGREE_INSTRUCTIONS).degree(len(leaves))
+                return scalarize(closed_jaxpr, max_instructions=MAX_DEGREE_INSTRUCTIONS).degree_bound(len(leaves))
             except UnsupportedPrimitive:
-                return array_degree_bound(closed_jaxpr, len(leaves))
+                return jaxpr_degree_bound(closed_jaxpr, len(leaves))
 
-    return _cached_result_or_none("degree", (function, model_key, dim), degree)
+    return _cached_result_or_none("degree", (function, model_key, dim), compute_degree)
 
 
 def vanishing_entry_indices(function: Callable, pytree: Any, *shapes: tuple[int, ...]) -> frozenset[int]:
@@ -205,7 +205,7 @@ def vanishing_entry_indices(function: Callable, pytree: Any, *shapes: tuple[int,
     """
     leaves, model_key, rebuild = _parameters_key_and_rebuilder(pytree)
 
-    def entries() -> frozenset[int]:
+    def find_vanishing_entries() -> frozenset[int]:
         arrays = [jax.ShapeDtypeStruct(shape, np.float64) for shape in (*map(np.shape, leaves), *shapes)]
         closed_jaxpr = jax.make_jaxpr(lambda *a: function(rebuild(a[: len(leaves)]), *a[len(leaves) :]))(*arrays)
         if any(isinstance(constant, jax.core.Tracer) for constant in closed_jaxpr.consts):
@@ -214,7 +214,7 @@ def vanishing_entry_indices(function: Callable, pytree: Any, *shapes: tuple[int,
             (values,) = scalarize(closed_jaxpr, max_instructions=MAX_DEGREE_INSTRUCTIONS).outputs
         return frozenset(i for i, value in enumerate(values) if type(value) is not str and value == 0.0)
 
-    return _cached_result_or_none("zeros", (function, model_key, shapes), entries) or frozenset()
+    return _cached_result_or_none("zeros", (function, model_key, shapes), find_vanishing_entries) or frozenset()
 
 
 def _parameters_key_and_rebuilder(pytree: Any) -> tuple[list, Any, Callable]:
@@ -233,7 +233,10 @@ _unrolled_cache: LRUCache[Any] = LRUCache(128)
 
 
 def _cached_result_or_none(result_name: str, key: tuple, compute: Callable) -> Any:
-    """Return ``compute()``, cached by a function and a model key; None if the function cannot be unrolled."""
+    """Return ``compute()``, cached by the name of the result and a key; None if the function cannot be unrolled.
+
+    The key begins with a function and the key of a model.
+    """
 
     def compute_or_none():
         try:
@@ -250,6 +253,7 @@ def _cached_result_or_none(result_name: str, key: tuple, compute: Callable) -> A
 
 
 def _evaluate_compiled(function: Callable, pytree: Any, points: np.ndarray) -> Any:
+    """Return ``function(pytree, x)`` for each x of points, shape (m, n), compiled by XLA."""
     # another function may be being traced; without one, compile-time evaluation would compile each constant
     is_tracing = is_traced(jnp.zeros(()))
     with jax.ensure_compile_time_eval() if is_tracing else contextlib.nullcontext():

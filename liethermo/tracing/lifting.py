@@ -15,7 +15,7 @@ from jax.extend.core import ClosedJaxpr, DebugInfo, Jaxpr, JaxprEqn, Literal, Va
 from manifolds._content_keys import content_key
 from manifolds.matrices.exponential import expm
 
-from .searches import has_while_loop
+from .searches import aval_dtype, has_while_loop
 
 MAX_INLINE_NUMBERS = 64
 """Largest number of entries of an array that is recomputed from its origin; a larger one is stored as a table."""
@@ -25,7 +25,7 @@ CALL_PRIMITIVES = ("jit", "pjit", "closed_call", "core_call")
 
 
 class ConstantLifter:
-    """Turns constants and nonzero float64 literals of a jaxpr, here called its numbers, into its first arguments.
+    """Turns the numbers of a jaxpr (its constants and nonzero float64 literals) into its first arguments.
 
     Zeros stay, because vanishing terms belong to the operations. Exponents with instructions of their own stay too, and
     so do numbers from which truth values or integers are computed.
@@ -88,10 +88,12 @@ class _LiftedBody:
         self._argument_free: dict[Var, Any] = {}
 
     def append_and_set_outputs(self, jaxpr: Jaxpr, consts: Sequence, arguments: Sequence) -> None:
+        """Append the equations of a jaxpr, with its numbers lifted, and store the atoms of its outputs."""
         env: dict[Var, Any] = dict(zip(jaxpr.invars, arguments, strict=True))
         self.outputs = self._append_equations(jaxpr, consts, env)
 
     def _append_equations(self, jaxpr: Jaxpr, consts: Sequence, env: dict[Var, Any]) -> list:
+        """Append the equations of a jaxpr, with calls inlined and numbers lifted; return the atoms of its outputs."""
         formula_uses = [
             (eqn.invars, FORMULA_INPUTS[eqn.primitive.name])
             for eqn in jaxpr.eqns
@@ -109,7 +111,7 @@ class _LiftedBody:
         for eqn in jaxpr.eqns:
             inputs = [read(a) for a in eqn.invars]
             if eqn.primitive.name in CALL_PRIMITIVES and isinstance(eqn.params.get("jaxpr"), ClosedJaxpr):
-                inner = _expm_substitute(eqn) or eqn.params["jaxpr"]
+                inner = _replacement_for_jax_expm(eqn) or eqn.params["jaxpr"]
                 results = self._append_equations(
                     inner.jaxpr, inner.consts, dict(zip(inner.jaxpr.invars, inputs, strict=True))
                 )
@@ -134,6 +136,7 @@ class _LiftedBody:
     # -- numbers and constants ------------------------------------------------------------------------------------
 
     def _lift_number(self, value, aval) -> Var:
+        """Record a number as an argument; return the variable that stands for it."""
         var = Var(aval)
         is_concrete = np.shape(value) == () and not isinstance(value, jax.Array)
         self.numbers.append((var, float(value) if is_concrete else value))
@@ -141,13 +144,15 @@ class _LiftedBody:
         return var
 
     def _keep_constant(self, var: Var, value) -> Var:
+        """Record a value as a constant of the jaxpr; return its variable."""
         self.constants[var] = self._argument_free[var] = value
         return var
 
     def _lift_or_keep(self, var: Var, value, must_stay_constant: bool):
+        """Lift a constant if it is a tracer or a float64 array that need not stay constant; return its variable."""
         if isinstance(value, jax.core.Tracer):
             return self._lift_number(value, var.aval)
-        if getattr(var.aval, "dtype", None) == np.float64 and not must_stay_constant:
+        if aval_dtype(var.aval) == np.float64 and not must_stay_constant:
             return self._lift_number(value if isinstance(value, jax.Array) else np.asarray(value), var.aval)
         return self._keep_constant(Var(var.aval), value)
 
@@ -168,14 +173,16 @@ class _LiftedBody:
         else:
             if not self.lifter.has_while_loop:
                 self.lifter.has_while_loop = any(map(has_while_loop, jaxprs_in_params(params)))
-            formula_index = _literal_input_index(name, inputs)
+            formula_index = _index_of_input_kept_literal(name, inputs)
             inputs = [a if i == formula_index else self._lift_literals([a])[0] for i, a in enumerate(inputs)]
         return inputs, params
 
     def _lift_literals(self, inputs: list) -> list:
+        """Return the inputs of an equation, with nonzero float64 literals replaced by variables of lifted numbers."""
         return [self._lift_number(a.val, a.aval) if _is_liftable_literal(a) else a for a in inputs]
 
     def _lift_inner_numbers(self, numbers: list[tuple[Var, Any]]) -> list[Var]:
+        """Lift the numbers of an inner jaxpr to this level too; return their variables at this level."""
         return [self._lift_number(value, var.aval) for var, value in numbers]
 
     def _lift_branches(self, branches, inputs: list) -> tuple[tuple, list]:
@@ -197,9 +204,10 @@ class _LiftedBody:
     # -- constant folding -----------------------------------------------------------------------------------------
 
     def _folded_outputs_or_none(self, eqn: JaxprEqn, inputs: list) -> list | None:
-        """Return the values of outputs that are integers, truth values or tables made from known numbers, or None.
+        """Return the values of an equation's outputs if they are to be folded into constants, or None.
 
-        These are truth values and integers, and tables that are made from large arrays: a table is stored as a whole.
+        Folded are truth values and integers that are computed from known numbers, and tables that are made from large
+        arrays: a table is stored as a whole.
         """
         makes_table = all(map(_is_large_float64, eqn.outvars)) and any(
             math.prod(a.aval.shape) > MAX_INLINE_NUMBERS for a in inputs
@@ -212,35 +220,35 @@ class _LiftedBody:
             return None
         memo: dict[Var, Any] = {}
 
-        def value(atom):
+        def evaluate_atom(atom):
             if isinstance(atom, Literal):
                 return atom.val
             if atom not in memo:
                 definition = self._argument_free[atom]
                 if isinstance(definition, tuple):
                     equation, i = definition
-                    definition = _evaluate_equation(equation, [value(a) for a in equation.invars])[i]
+                    definition = _evaluate_equation(equation, [evaluate_atom(a) for a in equation.invars])[i]
                 memo[atom] = definition
             return memo[atom]
 
-        values = [value(a) for a in inputs]
+        values = [evaluate_atom(a) for a in inputs]
         if any(isinstance(v, jax.core.Tracer) for v in values):
             return None
         return _evaluate_equation(eqn, values)
 
 
-def _expm_substitute(eqn: JaxprEqn) -> ClosedJaxpr | None:
-    """Return the library's matrix exponential for a call of JAX's, whose derivatives unroll badly; otherwise None."""
+def _replacement_for_jax_expm(eqn: JaxprEqn) -> ClosedJaxpr | None:
+    """Return the library's matrix exponential if an equation calls JAX's, whose derivatives unroll badly; else None."""
     if eqn.params.get("name") != "expm" or len(eqn.invars) != 1:
         return None
     aval: Any = eqn.invars[0].aval
-    jax_key, substitute = _expm_key_and_substitute(jax.ShapeDtypeStruct(aval.shape, aval.dtype))
+    jax_key, substitute = _jax_expm_key_and_replacement(jax.ShapeDtypeStruct(aval.shape, aval.dtype))
     return substitute if jax_key is not None and content_key(eqn.params["jaxpr"]) == jax_key else None
 
 
 @functools.lru_cache(maxsize=64)
-def _expm_key_and_substitute(shape) -> tuple[Hashable, ClosedJaxpr | None]:
-    """Return a key that identifies JAX's ``expm`` for this shape, and the jaxpr of ours; None for both if not found."""
+def _jax_expm_key_and_replacement(shape) -> tuple[Hashable, ClosedJaxpr | None]:
+    """Return a key of JAX's ``expm`` for this shape, and the jaxpr that replaces it; None for both if not found."""
     outer = jax.make_jaxpr(jax.scipy.linalg.expm)(shape)
     expm_equations = [eqn for eqn in outer.eqns if eqn.params.get("name") == "expm"]
     if len(expm_equations) != 1:
@@ -249,6 +257,7 @@ def _expm_key_and_substitute(shape) -> tuple[Hashable, ClosedJaxpr | None]:
 
 
 def _evaluate_equation(eqn: JaxprEqn, values: Sequence) -> list:
+    """Return the results of one equation for these values of its inputs, computed now."""
     inputs = [Var(a.aval) for a in eqn.invars]
     jaxpr = Jaxpr([], inputs, eqn.outvars, [eqn.replace(invars=list(inputs))], debug_info=DebugInfo("", "", None, None))
     with jax.ensure_compile_time_eval():
@@ -256,22 +265,23 @@ def _evaluate_equation(eqn: JaxprEqn, values: Sequence) -> list:
 
 
 def _debug_info_without_names(jaxpr: Jaxpr) -> DebugInfo:
+    """Return the debug information of a jaxpr without the names of its arguments and results."""
     return jaxpr.debug_info._replace(arg_names=None, result_paths=None)  # the arguments have changed
 
 
 def _is_inexact(aval) -> bool:
-    dtype = getattr(aval, "dtype", None)
+    dtype = aval_dtype(aval)
     return dtype is not None and jnp.issubdtype(dtype, jnp.inexact)
 
 
 def _is_large_float64(var: Var) -> bool:
     aval: Any = var.aval
-    return getattr(aval, "dtype", None) == np.float64 and aval.size > MAX_INLINE_NUMBERS
+    return aval_dtype(aval) == np.float64 and aval.size > MAX_INLINE_NUMBERS
 
 
 def _is_liftable_literal(atom) -> bool:
     """Return whether an atom is a literal that is lifted: a nonzero scalar of double precision."""
-    if not isinstance(atom, Literal) or getattr(atom.aval, "dtype", None) != np.float64:
+    if not isinstance(atom, Literal) or aval_dtype(atom.aval) != np.float64:
         return False
     return bool(atom.val != 0.0) and np.shape(atom.val) == ()
 
@@ -280,8 +290,8 @@ FORMULA_INPUTS = {"pow": (1, 2.0), "polygamma": (0, 1.0)}
 """Input that selects the formula of a primitive, and a factor; it stays a constant if their product is an integer."""
 
 
-def _literal_input_index(name: str, inputs: list) -> int | None:
-    """Return the index of the input that must stay a literal, or None."""
+def _index_of_input_kept_literal(name: str, inputs: list) -> int | None:
+    """Return the index of the input of a primitive that must stay a literal because it selects a formula, or None."""
     index, factor = FORMULA_INPUTS.get(name, (0, 0.0))
     is_literal = factor and isinstance(inputs[index], Literal)
     return index if is_literal and float(factor * np.real(inputs[index].val)).is_integer() else None

@@ -14,8 +14,8 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 from manifolds._pytree_module import Module
 
 
-class NumpyArray(NDArrayOperatorsMixin):
-    """An array of JAX that functions of NumPy accept: each calls the function of ``jax.numpy`` with its name."""
+class NumpyCompatibleArray(NDArrayOperatorsMixin):
+    """A JAX array that NumPy's functions accept: each calls the function of ``jax.numpy`` that has its name."""
 
     def __init__(self, array: jax.Array):
         self.array = array
@@ -56,16 +56,17 @@ class NumpyArray(NDArrayOperatorsMixin):
 
 
 def unwrap_array(value: Any) -> Any:
-    """Return the array of a :class:`NumpyArray`; other values are returned unchanged."""
-    return value.array if isinstance(value, NumpyArray) else value
+    """Return the array of a :class:`NumpyCompatibleArray`; other values are returned unchanged."""
+    return value.array if isinstance(value, NumpyCompatibleArray) else value
 
 
 def _wrap_arrays(value: Any) -> Any:
-    return jax.tree_util.tree_map(lambda a: NumpyArray(a) if isinstance(a, jax.Array) else a, value)
+    """Return a pytree with each JAX array in it as a :class:`NumpyCompatibleArray`."""
+    return jax.tree_util.tree_map(lambda a: NumpyCompatibleArray(a) if isinstance(a, jax.Array) else a, value)
 
 
-def with_jax_arrays(function: Callable) -> Callable:
-    """Return a function of arrays of JAX from one that is written with NumPy."""
+def accept_jax_arrays(function: Callable) -> Callable:
+    """Return a function that accepts and returns JAX arrays, from a function written with NumPy."""
 
     def call(*arguments):
         return jnp.asarray(unwrap_array(function(*map(_wrap_arrays, arguments))), dtype=jnp.float64)
@@ -74,29 +75,29 @@ def with_jax_arrays(function: Callable) -> Callable:
 
 
 class PythonCall(Module):
-    """A function from arrays to a number that a program calls in Python: it cannot be traced.
+    """A function from arrays to a number that cannot be traced, so that programs call it in Python.
 
-    An exception of the function is kept, and the value is NaN: see :meth:`raise_error`.
+    An exception of the function is kept, and the value is NaN: see :meth:`raise_first_error`.
     """
 
     function: Callable = eqx.field(static=True)
-    errors: _Errors = eqx.field(static=True)
+    errors: _HashableErrorList = eqx.field(static=True)
 
     def __init__(self, function: Callable):
-        self.function, self.errors = function, _Errors()
+        self.function, self.errors = function, _HashableErrorList()
 
     def __call__(self, *arguments) -> jax.Array:
         result = jax.ShapeDtypeStruct((), jnp.float64)
-        return jax.pure_callback(self._value, result, *arguments, vmap_method="sequential")
+        return jax.pure_callback(self._evaluate_in_python, result, *arguments, vmap_method="sequential")
 
-    def _value(self, *arguments) -> np.ndarray:
+    def _evaluate_in_python(self, *arguments) -> np.ndarray:
         try:
             return np.asarray(self.function(*map(np.asarray, arguments)), dtype=np.float64).reshape(())
         except Exception as error:
             self.errors.append(error)
             return np.asarray(np.nan)
 
-    def raise_error(self) -> None:
+    def raise_first_error(self) -> None:
         """Raise the first exception of the function since the last call of this method."""
         if self.errors:
             error, *_ = self.errors
@@ -104,8 +105,8 @@ class PythonCall(Module):
             raise error
 
 
-class _Errors(list):
-    """Exceptions of one function: a list that can be hashed."""
+class _HashableErrorList(list):
+    """A list of exceptions that is hashed and compared by identity."""
 
     def __hash__(self) -> int:  # type: ignore[override]
         return id(self)

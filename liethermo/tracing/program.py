@@ -16,7 +16,7 @@ from .calls import MatrixProduct
 
 
 class _InterpretationPlan(NamedTuple):
-    """Instructions on a list of values, whose indices are called slots.
+    """The plan by which a program is interpreted: instructions on a list of values, whose indices are called slots.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class _InterpretationPlan(NamedTuple):
 
 @dataclass(frozen=True)
 class Program:
-    """Scalar instructions in order; each variable is assigned once.
+    """A scalar program: instructions in order, each of which assigns one new variable.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class Program:
         return count + sum(program.instruction_count for block in blocks for program in block.inner_programs)
 
     def evaluate(self, *arrays, batch: bool = False) -> list[np.ndarray]:
-        """Evaluate the outputs for input arrays with NumPy, without compiling.
+        """Return the output arrays for these input arrays, computed with NumPy, without compiling.
 
         With ``batch``, inputs and outputs have one more leading axis, of equal length for all.
         """
@@ -85,16 +85,19 @@ class Program:
                 array[..., i] = a
             return array.reshape((*batch_shape, *shape))
 
-        return [assemble_output(entries, shape) for entries, shape in zip(self.run(*values), self.shapes, strict=True)]
+        return [
+            assemble_output(entries, shape)
+            for entries, shape in zip(self.evaluate_entries(*values), self.shapes, strict=True)
+        ]
 
-    def run(self, *arrays: Sequence) -> list[list]:
-        """Evaluate the program with NumPy: return the entries of its outputs for those of its inputs.
+    def evaluate_entries(self, *input_entries: Sequence) -> list[list]:
+        """Return a list of entries for each output from a sequence of entries for each input, computed with NumPy.
 
-        Entries are numbers, or arrays over many points.
+        An entry is a number, or an array over many points.
         """
         plan = self._interpretation_plan
         values = plan.initial_values.copy()
-        for slots, entries in zip(plan.input_slots, arrays, strict=True):
+        for slots, entries in zip(plan.input_slots, input_entries, strict=True):
             for slot, entry in zip(slots, entries, strict=True):
                 values[slot] = entry
         with np.errstate(all="ignore"):
@@ -104,7 +107,7 @@ class Program:
 
     @functools.cached_property
     def _interpretation_plan(self) -> _InterpretationPlan:
-        """The steps by which the program is interpreted.
+        """Plan by which NumPy interprets the program.
 
         A slot is reused after its value is read for the last time, so arrays of many points stay in the processor's
         cache.
@@ -119,22 +122,22 @@ class Program:
             initial_values.append(value)
             return len(initial_values) - 1
 
-        def slots_of(args) -> list[int]:
-            return [slots[a] if type(a) is str else new_slot(a) for a in args]
+        def assign_slots(scalars) -> list[int]:
+            return [slots[a] if type(a) is str else new_slot(a) for a in scalars]
 
         slots.update((name, new_slot()) for names in self.inputs for name in names)
-        input_slots, instructions = [slots_of(names) for names in self.inputs], []
+        input_slots, instructions = [assign_slots(names) for names in self.inputs], []
         for i, (target, op, args) in enumerate(self.instructions):
-            argument_slots = slots_of(args)
+            argument_slots = assign_slots(args)
             free_slots += [slots[a] for a in set(args) if type(a) is str and last_use[a] == i]
             slots[target] = free_slots.pop() if free_slots else new_slot()
             instructions.append((implementation(op), slots[target], argument_slots))
             if target not in last_use:
                 free_slots.append(slots[target])
-        output_slots = [slots_of(entries) for entries in self.outputs]
+        output_slots = [assign_slots(entries) for entries in self.outputs]
         return _InterpretationPlan(input_slots, initial_values, instructions, output_slots)
 
-    def degree(self, input_index: int) -> float:
+    def degree_bound(self, input_index: int) -> float:
         """Return an upper bound of the degree of the outputs as polynomials in one input array, or infinity.
 
         Parameters
@@ -206,13 +209,13 @@ class WhileLoop(Block):
     ----------
     test, body : Program
         Programs of the two arrays; the result of ``test`` is one truth value.
-    kinds : tuple of str
+    result_kinds : tuple of str
         Kinds of the carry.
     """
 
     test: Program
     body: Program
-    kinds: tuple[str, ...]
+    result_kinds: tuple[str, ...]
     name: str = field(default="while", repr=False)
 
     @property
@@ -223,10 +226,10 @@ class WhileLoop(Block):
         n_constants = len(self.test.inputs[0])
         constants, carry = args[:n_constants], list(args[n_constants:])
         while True:
-            ((is_running,),) = self.test.run(constants, carry)
+            ((is_running,),) = self.test.evaluate_entries(constants, carry)
             if not np.any(is_running):
                 return carry
-            (next_carry,) = self.body.run(constants, carry)
+            (next_carry,) = self.body.evaluate_entries(constants, carry)
             carry = [
                 np.where(is_running, new_value, old_value)[()]
                 for new_value, old_value in zip(next_carry, carry, strict=True)
@@ -263,7 +266,7 @@ class ScanLoop(Block):
         return (self.body,)
 
     @property
-    def kinds(self) -> tuple[str, ...]:  # type: ignore[override]
+    def result_kinds(self) -> tuple[str, ...]:  # type: ignore[override]
         return self.carry_kinds + tuple(kind for kind in self.stacked_kinds for _ in range(self.length))
 
     def __call__(self, *args) -> list:
@@ -272,7 +275,7 @@ class ScanLoop(Block):
         constants, carry, tables = args[:n_constants], list(args[n_constants:table_start]), args[table_start:]
         columns: list[list] = [[None] * self.length for _ in self.stacked_kinds]
         for i in range(self.length)[::-1] if self.reverse else range(self.length):
-            carry, row = self.body.run(constants, carry, [table[i] for table in tables])
+            carry, row = self.body.evaluate_entries(constants, carry, [table[i] for table in tables])
             for column, value in zip(columns, row, strict=True):
                 column[i] = value
         return carry + [a for column in columns for a in column]
@@ -292,22 +295,23 @@ class Routine(Block):
     name: str = field(default="routine", repr=False)
 
     @property
-    def kinds(self) -> tuple[str, ...]:  # type: ignore[override]
+    def result_kinds(self) -> tuple[str, ...]:  # type: ignore[override]
         return ("f",) * len(self.program.outputs[0])
 
     def __call__(self, *args) -> list:
-        return self.program.run(args)[0]
+        return self.program.evaluate_entries(args)[0]
 
 
 # -- dead code --------------------------------------------------------------------------------------------------------
 
 
-def live_instructions_and_new_names(
+def eliminate_dead_code_and_rename(
     instructions: Sequence[Instruction], results: Sequence[Scalar]
 ) -> tuple[tuple[Instruction, ...], dict[Scalar, str]]:
-    """Return the instructions that the results depend on, each as late as its first use allows, and their new names.
+    """Drop the instructions that the results do not need; return the others, renamed, and their new names by old name.
 
-    A value that is computed just before its use occupies a register for a short time.
+    Each instruction is as late as its first use allows: a value that is computed just before its use
+    occupies a register for a short time.
     """
     definitions: dict[Scalar, Instruction] = {instruction.target: instruction for instruction in instructions}
     order: list[Instruction] = []

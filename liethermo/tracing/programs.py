@@ -42,7 +42,7 @@ CHECKSUM_BYTES = 32
 MAX_FILE_BYTES = 2**28
 """Largest size in bytes of a file that is read."""
 
-SAFE_OPEN_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
+SAFE_OPEN_FLAGS = disk.SAFE_OPEN_FLAGS | getattr(os, "O_NONBLOCK", 0)
 """Flags that refuse to open a link and do not wait for the other end of a pipe."""
 
 
@@ -66,7 +66,7 @@ def host_processor() -> tuple[str, str, str]:
 
 def read_machine_code(name: str, suffix: str = ".o") -> bytes | None:
     """Return the machine code written under ``name``; None if it is missing, damaged, or may be another user's."""
-    folder = _trusted_folder()
+    folder = _trusted_cache_folder()
     if folder is None:
         return None
     try:
@@ -88,14 +88,14 @@ def read_machine_code(name: str, suffix: str = ".o") -> bytes | None:
 
 def write_machine_code(name: str, code: bytes, suffix: str = ".o") -> None:
     """Write machine code to the cache under ``name``, if there is a folder that can be used."""
-    folder = _trusted_folder()
+    folder = _trusted_cache_folder()
     if folder is not None:
         with contextlib.suppress(OSError):
             disk.write_atomically(folder / f"{name}{suffix}", hashlib.sha256(code).digest() + code, mode=0o600)
             disk.remove_abandoned_files(folder, f"{name}{suffix}")
 
 
-def _trusted_folder() -> Path | None:
+def _trusted_cache_folder() -> Path | None:
     """Return the cache folder, created if necessary; None if it cannot be used or others might write to it."""
     folder = cache_folder()
     if folder is None:
@@ -175,8 +175,8 @@ def jit_unoptimised(function: FunctionT) -> FunctionT:
     return _jit_with_options(function, UNOPTIMISED_XLA_OPTIONS)
 
 
-def subprogram(function: FunctionT) -> FunctionT:
-    """Decorator: trace a function of pytrees once for all places where a program calls it.
+def jit_subprogram(function: FunctionT) -> FunctionT:
+    """Decorator: trace a function of pytrees once, as a jitted subprogram of every program that calls it.
 
     The function is called directly if no argument is traced, or if an argument cannot be hashed.
     """
@@ -185,7 +185,7 @@ def subprogram(function: FunctionT) -> FunctionT:
     def call(*arguments):
         if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(arguments)):
             return function(*arguments)
-        array_function, dynamic, key = _split_arguments(function, arguments)
+        array_function, dynamic, key = _split_static_and_dynamic_arguments(function, arguments)
         try:
             hash(key)
         except TypeError:
@@ -196,13 +196,17 @@ def subprogram(function: FunctionT) -> FunctionT:
 
 
 def _jit_with_options(function: FunctionT, options: dict | None) -> FunctionT:
+    """Return a function that compiles itself with options of XLA, or becomes a part of a program that is traced."""
+
     @functools.wraps(function)
     def call(*arguments):
-        array_function, dynamic, key = _split_arguments(function, arguments)
+        array_function, dynamic, key = _split_static_and_dynamic_arguments(function, arguments)
         is_part_of_program = _is_being_traced(dynamic)
         program = _program_cache.get_or_compute(
             (key, is_part_of_program),
-            lambda: jax.jit(array_function) if is_part_of_program else _compile(array_function, dynamic, options),
+            lambda: (
+                jax.jit(array_function) if is_part_of_program else _compile_or_load(array_function, dynamic, options)
+            ),
         )
         return program(dynamic)
 
@@ -210,7 +214,7 @@ def _jit_with_options(function: FunctionT, options: dict | None) -> FunctionT:
 
 
 def _is_being_traced(arrays: tuple) -> bool:
-    """Return whether a call belongs to a program that is being traced, whose own options apply."""
+    """Return whether a program is being traced, of which a call with these arrays becomes a part."""
     return is_traced(arrays, jnp.zeros(()))
 
 
@@ -221,8 +225,8 @@ MIN_STORED_COMPILE_SECONDS = 0.1
 """Shortest time in seconds of a compilation whose result is written to disk."""
 
 
-def _compile(function: Callable, arguments: tuple, options: dict | None) -> Callable:
-    """Return the program of a function of arrays, from the cache on disk or compiled by XLA.
+def _compile_or_load(function: Callable, arguments: tuple, options: dict | None) -> Callable:
+    """Return the compiled program of a function of arrays, loaded from the cache on disk or compiled by XLA.
 
     The cache is found by the text of the program, so it never returns the program of another function. The text has
     all arguments, also those that the program does not use: without them, programs that use different ones of their
@@ -232,33 +236,33 @@ def _compile(function: Callable, arguments: tuple, options: dict | None) -> Call
     """
     devices = jax.devices()
     is_cpu = devices[0].platform == "cpu"
-    jitted = jax.jit(function, keep_unused=True, compiler_options=options if is_cpu else None)
+    jitted_function = jax.jit(function, keep_unused=True, compiler_options=options if is_cpu else None)
     if len(devices) > 1 or not is_cpu or getattr(jax.config, "jax_compilation_cache_dir"):  # noqa: B009
-        return jitted
-    lowered = jitted.lower(arguments)
-    text = lowered.as_text()
+        return jitted_function
+    lowered_program = jitted_function.lower(arguments)
+    text = lowered_program.as_text()
     if "callback" in text:
-        return lowered.compile()
+        return lowered_program.compile()
     name = hashlib.sha256(f"{_compiler_identity()} {options}\n{text}".encode()).hexdigest()[:32]
-    if (program := _stored_program(name, lowered)) is not None:
+    if (program := _load_stored_program(name, lowered_program)) is not None:
         return program
     start = time.perf_counter()
-    compiled = lowered.compile()
+    compiled_program = lowered_program.compile()
     if time.perf_counter() - start >= MIN_STORED_COMPILE_SECONDS:
-        write_machine_code(name, zlib.compress(serialize_executable.serialize(compiled)[0], 1), XLA_SUFFIX)
-    return compiled
+        write_machine_code(name, zlib.compress(serialize_executable.serialize(compiled_program)[0], 1), XLA_SUFFIX)
+    return compiled_program
 
 
 XLA_SUFFIX = ".xla"
 """Suffix of the files of programs that XLA compiled."""
 
 
-def _stored_program(name: str, lowered: Any) -> Callable | None:
-    """Return the program written to disk under ``name``; None if there is none that can be loaded."""
+def _load_stored_program(name: str, lowered_program: Any) -> Callable | None:
+    """Load the compiled program that was written to disk under ``name``; None if there is none that can be loaded."""
     code = read_machine_code(name, XLA_SUFFIX)
     if code is None:
         return None
-    trees = lowered.in_tree, lowered.out_tree
+    trees = lowered_program.in_tree, lowered_program.out_tree
     try:
         return serialize_executable.deserialize_and_load(zlib.decompress(code), *trees)
     except Exception:  # of any kind, from XLA's and JAX's insides: the program is compiled again
@@ -268,7 +272,7 @@ def _stored_program(name: str, lowered: Any) -> Callable | None:
 @functools.cache
 def _compiler_identity() -> str:
     """Return a text that identifies this machine and its compiler; XLA divides work among the cores it sees."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    cores = disk.available_cores()
     flags = os.environ.get("XLA_FLAGS", "")
     return f"{host_processor()} {cores} {jax.__version__} {jaxlib.__version__} {flags}"
 
@@ -279,8 +283,11 @@ def _strip_weak_type(array):
     return np.asarray(array) if is_weak else array
 
 
-def _split_arguments(function: Callable, arguments: tuple) -> tuple[_ArrayFunction, tuple, tuple]:
-    """Split arguments into a function of their arrays alone, these arrays, and a hashable key of all the rest."""
+def _split_static_and_dynamic_arguments(function: Callable, arguments: tuple) -> tuple[_ArrayFunction, tuple, tuple]:
+    """Return a function of the arrays among the arguments alone, these arrays, and a key of everything else.
+
+    The key can be hashed if the other arguments can; it contains the shapes and dtypes of the arrays.
+    """
     leaves, structure = jax.tree_util.tree_flatten(arguments)
     dynamic = tuple(_strip_weak_type(leaf) if eqx.is_array(leaf) else None for leaf in leaves)
     static = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)

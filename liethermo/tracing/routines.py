@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from .builder import Builder, EnclosingScope, Scalar
+from .builder import EnclosingScope, ProgramBuilder, Scalar
 from .caching import LRUCache
 from .calls import MatrixProduct
-from .complex_numbers import flatten_scalars, scalar_kinds, unflatten_scalars
-from .program import Program, Routine, live_instructions_and_new_names
+from .complex_numbers import flatten_scalars, real_scalar_kinds, unflatten_scalars
+from .program import Program, Routine, eliminate_dead_code_and_rename
 
 MIN_ROUTINE_PRODUCTS = 2
 """Smallest number of products of matrices, as loops, for which a function becomes a routine."""
@@ -24,7 +24,7 @@ _routine_cache: LRUCache[tuple] = LRUCache(256)
 
 
 def call_routine_or_unroll(
-    b: Builder, unroll: Callable, closed_jaxpr: ClosedJaxpr, arguments: Sequence[np.ndarray]
+    builder: ProgramBuilder, unroll: Callable, closed_jaxpr: ClosedJaxpr, arguments: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
     """Return the results of a function, computed by a routine if it is long enough, and unrolled otherwise.
 
@@ -37,7 +37,7 @@ def call_routine_or_unroll(
         Unrolls a jaxpr: :func:`.scalarize._unroll_jaxpr`.
     """
     scalars = flatten_scalars(arguments)
-    input_positions = [b.input_positions_or_none(x.ravel().tolist()) if x.ndim > 1 else None for x in arguments]
+    input_positions = [builder.input_positions_or_none(x.ravel().tolist()) if x.ndim > 1 else None for x in arguments]
     integer_values = [a if type(a) in (int, bool) else None for a in scalars]
     key = (
         id(closed_jaxpr),
@@ -46,18 +46,19 @@ def call_routine_or_unroll(
     )
     # the entry holds the jaxpr, so that no other object takes its id
     routine_call = _routine_cache.get_or_compute(
-        key, lambda: (closed_jaxpr, _RoutineCall.build(b, unroll, closed_jaxpr, arguments, input_positions))
+        key,
+        lambda: (closed_jaxpr, _RoutineCall.build_or_none(builder, unroll, closed_jaxpr, arguments, input_positions)),
     )[1]
     return (
-        unroll(b, closed_jaxpr.jaxpr, closed_jaxpr.consts, arguments)
+        unroll(builder, closed_jaxpr.jaxpr, closed_jaxpr.consts, arguments)
         if routine_call is None
-        else routine_call.emit_call(b, scalars, closed_jaxpr)
+        else routine_call.emit_call(builder, scalars, closed_jaxpr)
     )
 
 
 @dataclass(frozen=True)
 class _RoutineCall:
-    """A function as a routine, with the origin of its arguments and results.
+    """A routine that computes a function, with the origin of the routine's arguments and of the function's results.
 
     Attributes
     ----------
@@ -75,13 +76,14 @@ class _RoutineCall:
     result_sources: tuple[Scalar | tuple[int] | None, ...]
 
     @classmethod
-    def build(
-        cls, b: Builder, unroll: Callable, closed_jaxpr: ClosedJaxpr, arguments, input_positions: Sequence
+    def build_or_none(
+        cls, builder: ProgramBuilder, unroll: Callable, closed_jaxpr: ClosedJaxpr, arguments, input_positions: Sequence
     ) -> _RoutineCall | None:
-        scope, argument_indices = EnclosingScope(b), dict[Scalar, int]()  # index of each inner name
-        inner_builder, entries = Builder(b.max_instructions, scope), list[Scalar]()
+        """Unroll a function into a routine; None if it is too short to become one."""
+        scope, argument_indices = EnclosingScope(builder), dict[Scalar, int]()  # index of each inner name
+        inner_builder, entries = ProgramBuilder(builder.max_instructions, scope), list[Scalar]()
         for x, aval, positions in zip(arguments, closed_jaxpr.in_avals, input_positions, strict=True):
-            for kind, a in zip(scalar_kinds([aval]), flatten_scalars([x]), strict=True):
+            for kind, a in zip(real_scalar_kinds([aval]), flatten_scalars([x]), strict=True):
                 if type(a) in (str, float):
                     name = f"x1_{len(entries)}" if positions is None else scope.import_scalar(a)
                     argument_indices.setdefault(name, len(entries))
@@ -96,7 +98,7 @@ class _RoutineCall:
             )
         )
         computed_results = [a for a in results if type(a) is str and a not in argument_indices]
-        instructions, new_names = live_instructions_and_new_names(inner_builder.instructions, computed_results)
+        instructions, new_names = eliminate_dead_code_and_rename(inner_builder.instructions, computed_results)
         blocks = [i.op for i in instructions if isinstance(i.op, MatrixProduct | Routine)]
         if (
             len(instructions) <= MIN_ROUTINE_INSTRUCTIONS
@@ -122,20 +124,24 @@ class _RoutineCall:
         )
         return cls(Routine(program), argument_sources, result_sources)
 
-    def emit_call(self, b: Builder, scalars: Sequence[Scalar], closed_jaxpr: ClosedJaxpr) -> list[np.ndarray]:
+    def emit_call(
+        self, builder: ProgramBuilder, scalars: Sequence[Scalar], closed_jaxpr: ClosedJaxpr
+    ) -> list[np.ndarray]:
+        """Emit a call of the routine for the entries of all arguments; return the results of the function."""
+
         def argument_scalar(source) -> Scalar:
             if isinstance(source, int):
                 return scalars[source]
-            return b.table([scalars[entry] if isinstance(entry, int) else entry[0] for entry in source])
+            return builder.make_table([scalars[entry] if isinstance(entry, int) else entry[0] for entry in source])
 
-        results = iter(b.emit_block(self.routine, *map(argument_scalar, self.argument_sources)))
+        results = iter(builder.emit_block(self.routine, *map(argument_scalar, self.argument_sources)))
         entries = list[Scalar]()
-        for kind, result_source in zip(scalar_kinds(closed_jaxpr.out_avals), self.result_sources, strict=True):
+        for kind, result_source in zip(real_scalar_kinds(closed_jaxpr.out_avals), self.result_sources, strict=True):
             value = scalars[result_source[0]] if isinstance(result_source, tuple) else result_source
-            entries.append(_convert_to_kind(b, kind, next(results)) if value is None else value)
+            entries.append(_convert_to_kind(builder, kind, next(results)) if value is None else value)
         return unflatten_scalars(iter(entries), closed_jaxpr.out_avals)
 
 
-def _convert_to_kind(b: Builder, kind: str, a: Scalar) -> Scalar:
+def _convert_to_kind(builder: ProgramBuilder, kind: str, a: Scalar) -> Scalar:
     """Convert a real number, the form in which routines pass values, to a kind: real, truth value or integer."""
-    return a if kind == "f" else b.op("ne", a, 0.0) if kind == "b" else b.op("truncate", a)
+    return a if kind == "f" else builder.op("ne", a, 0.0) if kind == "b" else builder.op("truncate", a)

@@ -22,12 +22,20 @@ from manifolds.matrices import chains
 
 from ..errors import InputError, LiethermoError
 from . import indexing
-from .builder import Builder, EnclosingScope, LimitExceededError, Scalar, constant_array, elementwise, scalar_array
-from .complex_numbers import ComplexBuilder, flatten_scalars, scalar_kinds, unflatten_scalars
+from .builder import (
+    EnclosingScope,
+    LimitExceededError,
+    ProgramBuilder,
+    Scalar,
+    constant_array,
+    map_elementwise,
+    scalar_array,
+)
+from .complex_numbers import ComplexBuilder, flatten_scalars, real_scalar_kinds, unflatten_scalars
 from .primitives import SUPPORTED_PARAMETERS, UNROLLING_RULES
-from .program import Program, ScanLoop, WhileLoop, live_instructions_and_new_names
+from .program import Program, ScanLoop, WhileLoop, eliminate_dead_code_and_rename
 from .routines import MIN_ROUTINE_INSTRUCTIONS, call_routine_or_unroll
-from .searches import has_matrix_products
+from .searches import aval_dtype, has_matrix_products
 
 MAX_INSTRUCTIONS = 200_000
 """Largest number of instructions of a program: far more than compile in reasonable time."""
@@ -40,7 +48,7 @@ PACKAGE_FOLDERS = Path(__file__).parents[1], Path(chains.__file__).parents[1]
 
 
 class UnsupportedPrimitive(LiethermoError):
-    """A function cannot be unrolled.
+    """Error that a function cannot be unrolled.
 
     Attributes
     ----------
@@ -61,7 +69,7 @@ class UnsupportedPrimitive(LiethermoError):
 
 
 class CompilerFault(UnsupportedPrimitive):
-    """An unexpected exception inside the compiled engine: a fault of this library.
+    """Error that an unexpected exception occurred inside the compiled engine: a fault of this library.
 
     It replaces the exception, so that the array engine can take over.
 
@@ -112,7 +120,7 @@ def scalarize(
     UnsupportedPrimitive
         If a primitive has no rule, or the program exceeds the limit.
     """
-    builder = Builder(max_instructions)
+    builder = ProgramBuilder(max_instructions)
     inputs, arguments = [], []
     for i, var in enumerate(closed_jaxpr.jaxpr.invars):
         if var.aval.dtype != np.float64:
@@ -134,10 +142,12 @@ def scalarize(
     return _collect_program(builder, inputs, outputs, [x.shape for x in results])
 
 
-def _collect_program(b: Builder, inputs: Sequence, outputs: Sequence[Sequence[Scalar]], shapes: Sequence) -> Program:
-    """Return the program of a builder, without instructions that the outputs do not need."""
-    instructions, new_names = live_instructions_and_new_names(
-        b.instructions, [a for entries in outputs for a in entries]
+def _collect_program(
+    builder: ProgramBuilder, inputs: Sequence, outputs: Sequence[Sequence[Scalar]], shapes: Sequence
+) -> Program:
+    """Return the program of the instructions that a builder has collected, without those that no output needs."""
+    instructions, new_names = eliminate_dead_code_and_rename(
+        builder.instructions, [a for entries in outputs for a in entries]
     )
     return Program(
         tuple(map(tuple, inputs)),
@@ -147,24 +157,24 @@ def _collect_program(b: Builder, inputs: Sequence, outputs: Sequence[Sequence[Sc
     )
 
 
-def _unroll_jaxpr(b: Builder, jaxpr, consts, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
+def _unroll_jaxpr(builder: ProgramBuilder, jaxpr, consts, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Unroll a jaxpr; return its outputs as arrays of scalars."""
     values = dict(zip(jaxpr.constvars, map(constant_array, consts), strict=True))
     values.update(zip(jaxpr.invars, arguments, strict=True))
 
     def read(v) -> np.ndarray:
-        return constant_array(v.val, getattr(v.aval, "dtype", None)) if isinstance(v, Literal) else values[v]
+        return constant_array(v.val, aval_dtype(v.aval)) if isinstance(v, Literal) else values[v]
 
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         try:
             is_complex = _check_and_return_is_complex(eqn)
             control_rule = CONTROL_FLOW_RULES.get(name)
-            eqn_builder = ComplexBuilder(b) if is_complex and control_rule is None else b
+            eqn_builder = ComplexBuilder(builder) if is_complex and control_rule is None else builder
             outputs = (control_rule or UNROLLING_RULES.get(name) or _refuse_primitive)(
                 eqn_builder, eqn, *map(read, eqn.invars)
             )
-            results = _round_to_dtype(b, eqn, outputs if isinstance(outputs, list) else [outputs])
+            results = _round_to_dtype(builder, eqn, outputs if isinstance(outputs, list) else [outputs])
         except NotImplementedError as error:
             raise UnsupportedPrimitive(name, user_source_line(eqn), str(error)) from None
         except UnsupportedPrimitive as inner_error:
@@ -178,7 +188,7 @@ def _unroll_jaxpr(b: Builder, jaxpr, consts, arguments: Sequence[np.ndarray]) ->
                 inner_error.primitive, user_source_line(eqn), inner_error.reason, inner_error.too_large
             ) from None
         except LimitExceededError:
-            reason = f"within the size limit: the program exceeds {b.max_instructions} scalar instructions"
+            reason = f"within the size limit: the program exceeds {builder.max_instructions} scalar instructions"
             raise UnsupportedPrimitive(name, user_source_line(eqn), reason, too_large=True) from None
         except LiethermoError:
             raise
@@ -188,7 +198,8 @@ def _unroll_jaxpr(b: Builder, jaxpr, consts, arguments: Sequence[np.ndarray]) ->
     return [read(v) for v in jaxpr.outvars]
 
 
-def _refuse_primitive(b, eqn, *arguments):
+def _refuse_primitive(builder, eqn, *arguments):
+    """Raise NotImplementedError: the unrolling rule of a primitive that has none."""
     raise NotImplementedError
 
 
@@ -199,8 +210,8 @@ def _check_and_return_is_complex(eqn) -> bool:
             if name not in SUPPORTED_PARAMETERS.split() and value is not None:
                 raise NotImplementedError(f"with {name}={value}")
     for var in (*eqn.invars, *eqn.outvars):
-        dtype = getattr(var.aval, "dtype", None)
-        if getattr(dtype, "kind", None) not in ("f", "i", "u", "b", "c") or dtype in UNSUPPORTED_DTYPES:
+        dtype = aval_dtype(var.aval)
+        if not isinstance(dtype, np.dtype) or dtype.kind not in "fiubc" or dtype in UNSUPPORTED_DTYPES:
             raise NotImplementedError(f"on {var.aval}")
     return any(var.aval.dtype.kind == "c" for var in (*eqn.invars, *eqn.outvars))
 
@@ -214,7 +225,7 @@ MOVE_PRIMITIVES = frozenset(
 """Primitives that compute nothing: their entries were rounded or wrapped where they were computed."""
 
 
-def _round_to_dtype(b: Builder, eqn, results: list[np.ndarray]) -> list[np.ndarray]:
+def _round_to_dtype(builder: ProgramBuilder, eqn, results: list[np.ndarray]) -> list[np.ndarray]:
     """Return the results of an operation rounded to their data types: float32 rounded, integers wrapped around."""
     name, rounded_results = eqn.primitive.name, []
     for var, result in zip(eqn.outvars, results, strict=True):
@@ -224,7 +235,7 @@ def _round_to_dtype(b: Builder, eqn, results: list[np.ndarray]) -> list[np.ndarr
         assert result.shape == var.aval.shape, f"{name}: {result.shape} is not {var.aval.shape}"
         if name not in MOVE_PRIMITIVES and name not in CONTROL_FLOW_RULES:
             if dtype == np.float32:
-                result = elementwise(lambda a: b.op("single", a), result)
+                result = map_elementwise(lambda a: builder.op("single", a), result)
             elif (
                 dtype.kind in "iu"
                 and dtype != np.int64
@@ -232,7 +243,7 @@ def _round_to_dtype(b: Builder, eqn, results: list[np.ndarray]) -> list[np.ndarr
             ):
                 bits, is_signed = 8 * dtype.itemsize, dtype.kind == "i"
                 if name in WRAPPING_PRIMITIVES or eqn.invars[0].aval.dtype.kind in "iu":
-                    result = elementwise(lambda a, n=bits, s=is_signed: b.op("wrap", a, n, s), result)
+                    result = map_elementwise(lambda a, n=bits, s=is_signed: builder.op("wrap", a, n, s), result)
             if dtype.kind == "i":
                 limits, constants = np.iinfo(dtype), [a for a in result.flat if type(a) is not str]
                 if not all(limits.min <= a <= limits.max for a in constants):
@@ -251,26 +262,27 @@ WRAPPING_PRIMITIVES = frozenset(
 # -- primitives that contain jaxprs -----------------------------------------------------------------------------------
 
 
-def _unroll_call_equation(b, eqn, *arguments):
-    """Unroll a call; calls of one jaxpr with equal arguments are unrolled once."""
+def _unroll_call_equation(builder, eqn, *arguments):
+    """Unroll an equation that calls a jaxpr; calls of one jaxpr with equal arguments are unrolled once."""
     inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
     jaxpr = inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner
     entries = tuple(a if type(a) is str else repr(a) for a in flatten_scalars(arguments))
-    entry = b.call_results.get((id(jaxpr), entries))
+    entry = builder.call_results.get((id(jaxpr), entries))
     if entry is None:  # the entry holds the jaxpr, so that no other object takes its id
-        entry = b.call_results[id(jaxpr), entries] = jaxpr, _unroll_call(b, inner, arguments)
+        entry = builder.call_results[id(jaxpr), entries] = jaxpr, _unroll_call(builder, inner, arguments)
     return list(entry[1])
 
 
-def _unroll_call(b, inner, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
+def _unroll_call(builder, inner, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Unroll a jaxpr that an equation calls, as a routine if it has products of matrices; return its outputs."""
     if not isinstance(inner, ClosedJaxpr):
-        return _unroll_jaxpr(b, inner, (), arguments)
+        return _unroll_jaxpr(builder, inner, (), arguments)
     if has_matrix_products(inner.jaxpr):
-        return call_routine_or_unroll(b, _unroll_jaxpr, inner, arguments)
-    return _unroll_jaxpr(b, inner.jaxpr, inner.consts, arguments)
+        return call_routine_or_unroll(builder, _unroll_jaxpr, inner, arguments)
+    return _unroll_jaxpr(builder, inner.jaxpr, inner.consts, arguments)
 
 
-def _divided_difference_chain(b, eqn, *arguments):
+def _unroll_divided_difference_chain(builder, eqn, *arguments):
     """Unroll a chain of divided differences of a matrix function, by routines that all chains share."""
     (out_aval,), rank = (var.aval for var in eqn.outvars), arguments[0].ndim - 2
     function, slots = eqn.params["function"], eqn.params["slots"]
@@ -282,28 +294,33 @@ def _divided_difference_chain(b, eqn, *arguments):
         decomposition_avals: list = []
         # equal matrices are decomposed once, because equal calls merge
         for x, aval in zip(operands[:n_matrices], avals, strict=False):
-            closed_jaxpr = _traced_jaxpr(_decompose_for_chain, function, aval)
-            decompositions += call_routine_or_unroll(b, _unroll_jaxpr, closed_jaxpr, [x])
+            closed_jaxpr = _cached_jaxpr(_decompose_matrix, function, aval)
+            decompositions += call_routine_or_unroll(builder, _unroll_jaxpr, closed_jaxpr, [x])
             decomposition_avals += closed_jaxpr.out_avals
-        closed_jaxpr = _traced_jaxpr(
-            _apply_chain,
+        closed_jaxpr = _cached_jaxpr(
+            _divided_differences_from_decompositions,
             (function, slots, len(decompositions) // n_matrices),
             *decomposition_avals,
             *avals[n_matrices:],
         )
         (result[index],) = call_routine_or_unroll(
-            b, _unroll_jaxpr, closed_jaxpr, [*decompositions, *operands[n_matrices:]]
+            builder, _unroll_jaxpr, closed_jaxpr, [*decompositions, *operands[n_matrices:]]
         )
     return result
 
 
-def _decompose_for_chain(function: chains.MatrixFunction, a):
-    """Return the decomposition of a matrix that the divided differences of a function start from."""
-    return function.decompose(a, unrolled=True)
+def _decompose_matrix(matrix_function: chains.MatrixFunction, matrix):
+    """Return the arrays that decompose a matrix, from which divided differences of a matrix function are computed."""
+    return matrix_function.decompose(matrix, unrolled=True)
 
 
-def _apply_chain(function_slots_and_count: tuple[chains.MatrixFunction, tuple[int, ...], int], *arguments):
-    """Return a chain of divided differences of a matrix function, from the decompositions of its matrices."""
+def _divided_differences_from_decompositions(
+    function_slots_and_count: tuple[chains.MatrixFunction, tuple[int, ...], int], *arguments
+):
+    """Return a chain of divided differences of a matrix function.
+
+    The arguments are the arrays of the decompositions of its matrices, then the operands of the chain.
+    """
     function, slots, n_arrays = function_slots_and_count
     end = len(arguments) - len(slots)
     decompositions = [arguments[i : i + n_arrays] for i in range(0, end, n_arrays)]
@@ -311,35 +328,35 @@ def _apply_chain(function_slots_and_count: tuple[chains.MatrixFunction, tuple[in
 
 
 @functools.lru_cache(maxsize=256)
-def _traced_jaxpr(function, static_argument, *avals) -> ClosedJaxpr:
-    """Return the jaxpr of a function with a static argument; equal functions give one object, and so one routine."""
+def _cached_jaxpr(function, static_argument, *avals) -> ClosedJaxpr:
+    """Return the jaxpr of a function with a static argument; equal functions share one cached jaxpr and routine."""
     return jax.make_jaxpr(functools.partial(function, static_argument))(*avals)
 
 
-def _unroll_linear_solve(b, eqn, *arguments):
-    """Unroll the user's ``solve`` of ``custom_linear_solve``; its other jaxprs serve derivatives, already taken."""
+def _unroll_linear_solve(builder, eqn, *arguments):
+    """Unroll ``custom_linear_solve`` by its jaxpr ``solve``; its other jaxprs serve derivatives, already taken."""
     lengths, solve = eqn.params["const_lengths"], eqn.params["jaxprs"].solve
     solve_start = lengths.matvec + lengths.vecmat
     return _unroll_jaxpr(
-        b,
+        builder,
         solve.jaxpr,
         solve.consts,
         [*arguments[solve_start : solve_start + lengths.solve], *arguments[sum(lengths) :]],
     )
 
 
-def _unroll_cond(b, eqn, branch_index, *arguments):
+def _unroll_cond(builder, eqn, branch_index, *arguments):
     """Unroll every branch of a ``cond`` (they are pure functions), and return the results of the selected one."""
     avals = [var.aval for var in eqn.outvars]
     branches = eqn.params["branches"]
     branch_index = branch_index.item()
     if type(branch_index) is not str:
         branches = (branches[min(max(branch_index, 0), len(branches) - 1)],)
-    *other_results, result = (_unroll_jaxpr(b, branch.jaxpr, branch.consts, arguments) for branch in branches)
+    *other_results, result = (_unroll_jaxpr(builder, branch.jaxpr, branch.consts, arguments) for branch in branches)
     for i in reversed(range(len(other_results))):
-        is_branch = b.op("le", branch_index, i)
+        is_branch = builder.op("le", branch_index, i)
         result = unflatten_scalars(
-            iter(b.branch(is_branch, flatten_scalars(other_results[i]), flatten_scalars(result))), avals
+            iter(builder.select_side(is_branch, flatten_scalars(other_results[i]), flatten_scalars(result))), avals
         )
     return result
 
@@ -355,18 +372,19 @@ class _LoopScope(EnclosingScope):
 
     def unroll_body(
         self, closed_jaxpr: ClosedJaxpr, arguments: Sequence[np.ndarray]
-    ) -> tuple[Builder, list[np.ndarray]]:
-        body_builder = Builder(self.builder.max_instructions, self)
+    ) -> tuple[ProgramBuilder, list[np.ndarray]]:
+        """Unroll the body of the loop once; return the builder that holds its instructions, and its results."""
+        body_builder = ProgramBuilder(self.builder.max_instructions, self)
         return body_builder, _unroll_jaxpr(body_builder, closed_jaxpr.jaxpr, closed_jaxpr.consts, arguments)
 
-    def outer_scalars_read(self, builders: Sequence[Builder], results: Sequence[Scalar]) -> dict[Scalar, str]:
+    def outer_scalars_read(self, builders: Sequence[ProgramBuilder], results: Sequence[Scalar]) -> dict[Scalar, str]:
         """Return the inner names of the outer scalars that the instructions of a loop body read, by outer scalar."""
-        names = {*results, *(a for b in builders for i in b.instructions for a in i.args)}
+        names = {*results, *(a for builder in builders for i in builder.instructions for a in i.args)}
         return {a: name for a, name in self.inner_names.items() if name in names}
 
 
 class _LoopCarry:
-    """The carry of a loop. An entry that starts as a constant stays a constant until a pass of the loop changes it."""
+    """The carry of a loop: entries that start as constants stay constants until a pass of the loop changes them."""
 
     def __init__(self, start: Sequence[np.ndarray], avals: Sequence):
         self.avals, self.start = avals, flatten_scalars(start)
@@ -385,7 +403,7 @@ class _LoopCarry:
         ]
         for i in changed_indices:
             self.entries[i] = f"x1_{i}"
-        entry_kinds = scalar_kinds(self.avals)
+        entry_kinds = real_scalar_kinds(self.avals)
         return "".join(entry_kinds[i] for i in changed_indices)
 
     @property
@@ -393,8 +411,8 @@ class _LoopCarry:
         return [i for i, a in enumerate(self.entries) if type(a) is str]
 
     @property
-    def kinds(self) -> tuple[str, ...]:
-        entry_kinds = scalar_kinds(self.avals)
+    def variable_kinds(self) -> tuple[str, ...]:
+        entry_kinds = real_scalar_kinds(self.avals)
         return tuple(entry_kinds[i] for i in self.variable_indices)
 
     def final_arrays(self, final_values: Sequence[Scalar]) -> list[np.ndarray]:
@@ -405,11 +423,11 @@ class _LoopCarry:
         return unflatten_scalars(iter(entries), self.avals)
 
 
-def _unroll_while_loop(b, eqn, *arguments):
+def _unroll_while_loop(builder, eqn, *arguments):
     """Write a ``while`` loop as one block of the program; return its final carry as arrays of scalars."""
     params, avals = eqn.params, [var.aval for var in eqn.invars]
     n_test_constants, carry_start = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
-    scope, carry = _LoopScope(b), _LoopCarry(arguments[carry_start:], avals[carry_start:])
+    scope, carry = _LoopScope(builder), _LoopCarry(arguments[carry_start:], avals[carry_start:])
     test_constants = scope.import_arrays(arguments[:n_test_constants], avals[:n_test_constants])
     body_constants = scope.import_arrays(arguments[n_test_constants:carry_start], avals[n_test_constants:carry_start])
     test, body = params["cond_jaxpr"], params["body_jaxpr"]
@@ -419,9 +437,9 @@ def _unroll_while_loop(b, eqn, *arguments):
         if test_values.shape:  # a batch of loops: finished lanes keep their values
             (lane_tests,) = _unroll_jaxpr(body_builder, test.jaxpr, test.consts, [*test_constants, *carry.arrays])
             results = [
-                elementwise(
+                map_elementwise(
                     (ComplexBuilder(body_builder) if aval.dtype.kind == "c" else body_builder).select,
-                    np.broadcast_to(_expand_trailing_axes(lane_tests, x.ndim), x.shape),
+                    np.broadcast_to(_append_unit_axes(lane_tests, x.ndim), x.shape),
                     x,
                     old,
                 )
@@ -442,14 +460,14 @@ def _unroll_while_loop(b, eqn, *arguments):
         _collect_program(
             body_builder, inputs, [[next_carry[i] for i in carry.variable_indices]], [(len(carry.variable_indices),)]
         ).regroup_constant_factors([1]),
-        carry.kinds,
+        carry.variable_kinds,
     )
-    return carry.final_arrays(b.emit_block(loop, *variables, *(carry.start[i] for i in carry.variable_indices)))
+    return carry.final_arrays(builder.emit_block(loop, *variables, *(carry.start[i] for i in carry.variable_indices)))
 
 
-def _expand_trailing_axes(tests: np.ndarray, ndim: int) -> np.ndarray:
-    """Append axes of length one to an array of truth values."""
-    return tests.reshape(*tests.shape, *[1] * (ndim - tests.ndim))
+def _append_unit_axes(array: np.ndarray, ndim: int) -> np.ndarray:
+    """Return an array with axes of length one appended, so that it has ``ndim`` axes."""
+    return array.reshape(*array.shape, *[1] * (ndim - array.ndim))
 
 
 MAX_SHORT_LOOP_PASSES = 32
@@ -464,13 +482,13 @@ loop does.
 """
 
 
-def _unroll_scan(b, eqn, *arguments):
+def _unroll_scan(builder, eqn, *arguments):
     """Unroll a ``scan``, or write it as one block if it is long; return its results as arrays of scalars."""
     params = eqn.params
     inner, n_consts, carry_end = params["jaxpr"], params["num_consts"], params["num_consts"] + params["num_carry"]
     if params["length"] > 2:
-        loop_results = _scan_as_loop_if_long(
-            b, eqn, arguments[:n_consts], arguments[n_consts:carry_end], arguments[carry_end:]
+        loop_results = _emit_scan_loop_if_long(
+            builder, eqn, arguments[:n_consts], arguments[n_consts:carry_end], arguments[carry_end:]
         )
         if loop_results is not None:
             return loop_results
@@ -479,7 +497,7 @@ def _unroll_scan(b, eqn, *arguments):
     row_outputs = []
     for i in reversed(rows) if params["reverse"] else rows:
         results = _unroll_jaxpr(
-            b, inner.jaxpr, inner.consts, [*arguments[:n_consts], *carry, *(x[i, ...] for x in tables)]
+            builder, inner.jaxpr, inner.consts, [*arguments[:n_consts], *carry, *(x[i, ...] for x in tables)]
         )
         carry = results[: len(carry)]
         row_outputs.append(results[len(carry) :])
@@ -492,11 +510,11 @@ def _unroll_scan(b, eqn, *arguments):
     return carry + stacked_outputs
 
 
-def _scan_as_loop_if_long(b, eqn, constants, carry_start, row_tables) -> list[np.ndarray] | None:
-    """Write a ``scan`` as one block and return its results; None if it is short enough to be unrolled."""
+def _emit_scan_loop_if_long(builder, eqn, constants, carry_start, row_tables) -> list[np.ndarray] | None:
+    """Emit a ``scan`` as one loop block and return its results; None if it is short enough to be unrolled."""
     length, closed_jaxpr, avals = eqn.params["length"], eqn.params["jaxpr"], [var.aval for var in eqn.invars]
     n_consts, carry_end = len(constants), len(constants) + len(carry_start)
-    scope, carry = _LoopScope(b), _LoopCarry(carry_start, avals[n_consts:carry_end])
+    scope, carry = _LoopScope(builder), _LoopCarry(carry_start, avals[n_consts:carry_end])
     loop_constants = scope.import_arrays(constants, avals[:n_consts])
     row_avals = [aval.update(shape=aval.shape[1:]) for aval in avals[carry_end:]]
     columns = list(zip(*(flatten_scalars([x[i, ...] for x in row_tables]) for i in range(length)), strict=True))
@@ -533,9 +551,9 @@ def _scan_as_loop_if_long(b, eqn, constants, carry_start, row_tables) -> list[np
         [(len(variable_indices),), (len(row_results),)],
     )
     row_output_avals = [var.aval for var in closed_jaxpr.jaxpr.outvars[len(carry_start) :]]
-    loop = ScanLoop(length, eqn.params["reverse"], body, carry.kinds, scalar_kinds(row_output_avals))
-    tables = [b.table(column) for column in columns]
-    loop_results = b.emit_block(loop, *variables, *(carry.start[i] for i in variable_indices), *tables)
+    loop = ScanLoop(length, eqn.params["reverse"], body, carry.variable_kinds, real_scalar_kinds(row_output_avals))
+    tables = [builder.make_table(column) for column in columns]
+    loop_results = builder.emit_block(loop, *variables, *(carry.start[i] for i in variable_indices), *tables)
     stacked_entries = loop_results[len(variable_indices) :]
     row_arrays = [
         unflatten_scalars((stacked_entries[j * length + i] for j in range(len(row_results))), row_output_avals)
@@ -548,15 +566,17 @@ def _scan_as_loop_if_long(b, eqn, constants, carry_start, row_tables) -> list[np
     return carry.final_arrays(loop_results[: len(variable_indices)]) + stacked_outputs
 
 
-def _unroll_scatter(b, eqn, x, indices, updates):
+def _unroll_scatter(builder, eqn, x, indices, updates):
     """Unroll ``scatter``, which replaces entries by updates or by a function of the entries (``x.at[i].apply``)."""
-    entry_builder = ComplexBuilder(b) if eqn.invars[0].aval.dtype.kind == "c" else b
+    entry_builder = ComplexBuilder(builder) if eqn.invars[0].aval.dtype.kind == "c" else builder
     jaxpr, consts = eqn.params["update_jaxpr"], eqn.params["update_consts"]
     if jaxpr is None:
-        return indexing.scatter(entry_builder, eqn, x, indices, updates, lambda old, new: new)
+        return indexing.scatter(entry_builder, eqn, x, indices, updates, lambda old_entry, update: update)
 
-    def combine(old, new):
-        return _unroll_jaxpr(b, jaxpr, consts, [scalar_array([old], ()), scalar_array([new], ())])[0].item()
+    def combine(old_entry, update):
+        return _unroll_jaxpr(builder, jaxpr, consts, [scalar_array([old_entry], ()), scalar_array([update], ())])[
+            0
+        ].item()
 
     return indexing.scatter(entry_builder, eqn, x, indices, updates, combine)
 
@@ -565,7 +585,7 @@ CALL_PRIMITIVES = "jit pjit call closed_call core_call custom_jvp_call custom_vj
 CONTROL_FLOW_RULES = {
     **dict.fromkeys(CALL_PRIMITIVES.split(), _unroll_call_equation),
     "custom_linear_solve": _unroll_linear_solve,
-    chains.chain_p.name: _divided_difference_chain,
+    chains.chain_p.name: _unroll_divided_difference_chain,
     "cond": _unroll_cond,
     "scan": _unroll_scan,
     "scatter": _unroll_scatter,

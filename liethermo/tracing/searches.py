@@ -17,21 +17,22 @@ DATA_MOVEMENT = frozenset(
 """Primitives without arithmetic."""
 
 
-def iterate_equations(jaxpr: Jaxpr, repetitions: int = 1, *, in_calls: bool = False) -> Iterator[tuple[Any, int]]:
+def iterate_equations(jaxpr: Jaxpr, repetitions: int = 1, *, calls_only: bool = False) -> Iterator[tuple[Any, int]]:
     """Yield each equation of a jaxpr, then those of the jaxprs within it, with the number of times that it runs.
 
     The body of a loop of unknown length counts once.
 
     Parameters
     ----------
-    in_calls : bool
-        Whether to leave out branches, ``while`` loops and functions with their own derivatives.
+    calls_only : bool
+        Whether to enter only jaxprs that are called, and leave out branches, ``while`` loops and functions with their
+        own derivatives.
     """
     for equation in jaxpr.eqns:
         yield equation, repetitions
         params = equation.params
-        for inner in jaxprs_in_params({"jaxpr": params.get("jaxpr")} if in_calls else params):
-            yield from iterate_equations(inner, repetitions * params.get("length", 1), in_calls=in_calls)
+        for inner in jaxprs_in_params({"jaxpr": params.get("jaxpr")} if calls_only else params):
+            yield from iterate_equations(inner, repetitions * params.get("length", 1), calls_only=calls_only)
 
 
 def has_matrix_products(jaxpr: Jaxpr) -> bool:
@@ -39,8 +40,13 @@ def has_matrix_products(jaxpr: Jaxpr) -> bool:
     return any(
         equation.primitive.name == "dot_general"
         and max(math.prod(v.aval.shape) for v in equation.invars) > MAX_UNROLLED_INPUT_PRODUCTS
-        for equation, _ in iterate_equations(jaxpr, in_calls=True)
+        for equation, _ in iterate_equations(jaxpr, calls_only=True)
     )
+
+
+def aval_dtype(aval: Any) -> Any:
+    """Return the type of the numbers of an abstract value of JAX; None for a token, which has no numbers."""
+    return getattr(aval, "dtype", None)
 
 
 def has_while_loop(jaxpr: Jaxpr) -> bool:
@@ -49,11 +55,14 @@ def has_while_loop(jaxpr: Jaxpr) -> bool:
 
 
 def count_dense_operations(jaxpr: Jaxpr) -> int:
-    """Return the number of scalar operations of a jaxpr; one pass of a loop of unknown length is counted."""
-    return sum(repetitions * _count_operations(equation) for equation, repetitions in iterate_equations(jaxpr))
+    """Return the number of scalar operations of a jaxpr, operations on zeros included.
+
+    One pass of a loop of unknown length is counted.
+    """
+    return sum(repetitions * _count_equation_operations(equation) for equation, repetitions in iterate_equations(jaxpr))
 
 
-def _count_operations(equation: Any) -> int:
+def _count_equation_operations(equation: Any) -> int:
     """Return the number of scalar operations of an equation, without those of the jaxprs within it."""
     if equation.primitive.name in DATA_MOVEMENT or any(jaxprs_in_params(equation.params)):
         return 0

@@ -25,7 +25,7 @@ from .scalarize import user_source_line
 
 
 class TaylorSeriesError(InputError):
-    """A function has no Taylor series, or no rule for its series is known.
+    """Error that a function has no Taylor series, or that no rule for its series is known.
 
     Attributes
     ----------
@@ -45,16 +45,16 @@ class TaylorSeriesError(InputError):
         return type(self)(self.primitive, self.source_line, subject, f": {advice}")
 
 
-def check_taylor_series(function: Callable, x) -> None:
+def check_has_taylor_series(function: Callable, x) -> None:
     """Raise TaylorSeriesError unless a function of an array like x has a Taylor series; compute no coefficients."""
     jax.eval_shape(lambda x: _Recurrences(function, x).evaluation_order and (), jnp.zeros_like(x))
 
 
-def increment_taylor_coefficients(field: Callable, x, h, order: int) -> jax.Array:
-    """Return the coefficients ``c_1 ... c_order``, shape (order, n), of ``x(h s) = x + c_1 s + c_2 s^2 + ...``.
+def solution_taylor_coefficients(field: Callable, x, h, order: int) -> jax.Array:
+    """Return the Taylor coefficients of orders 1 to ``order`` of the solution of ``x' = field(x)`` over a step h.
 
-    This x(h s) is the solution of ``x' = field(x)`` that begins at x, shape (n,). The coefficients are computed one
-    after another, in a loop.
+    The solution that begins at x, shape (n,), is ``x(h s) = x + c_1 s + c_2 s^2 + ...``; the result, shape (order, n),
+    holds ``c_1, c_2, ...``. The coefficients are computed one after another, in a loop.
 
     Raises
     ------
@@ -66,24 +66,24 @@ def increment_taylor_coefficients(field: Callable, x, h, order: int) -> jax.Arra
         return jnp.zeros((order, *x.shape)).at[0].set(h * recurrences.constant)
     histories = {
         i: _store_coefficient(jnp.zeros((order, *start.shape), start.dtype), start, 0)
-        for i, start in recurrences.indexed_history_starts()
+        for i, start in recurrences.initial_coefficients_of_histories()
     }
 
-    def coefficient(carry, numbers):
+    def compute_next_coefficient(carry, order_numbers):
         histories, rate = carry
-        n, n_float = numbers
+        n, n_float = order_numbers
         rate, histories = recurrences.next_coefficient_and_histories(n, n_float, rate / n_float, histories)
         return (histories, h * rate), carry[1] / n_float
 
-    numbers = np.arange(1, order), np.arange(1.0, order)
+    order_numbers = np.arange(1, order), np.arange(1.0, order)
     (_, rate), coefficients = jax.lax.scan(
-        coefficient, (histories, h * recurrences.terms[recurrences.result].start), numbers
+        compute_next_coefficient, (histories, h * recurrences.terms[recurrences.result].start), order_numbers
     )
     return jnp.concatenate([coefficients, rate[None] / order])
 
 
 class _SeriesTerm(NamedTuple):
-    """The series of an intermediate value.
+    """The Taylor series of an intermediate value, by its first coefficient and a recurrence.
 
     Attributes
     ----------
@@ -108,14 +108,14 @@ class _SeriesTerm(NamedTuple):
     refusal: tuple[str, str] = ("", "")
 
 
-class _SeriesIndex(NamedTuple):
-    """The index of a term, as a type that differs from a constant."""
+class _TermReference(NamedTuple):
+    """A reference to a term by its index, of a type that differs from that of a constant."""
 
     term_index: int
 
 
 class _Recurrences:
-    """The series of all intermediate values of a function, with the rules that compute their coefficients.
+    """The Taylor series of all intermediate values of a function, with the recurrences that compute their coefficients.
 
     Attributes
     ----------
@@ -129,9 +129,9 @@ class _Recurrences:
 
     def __init__(self, function: Callable, x):
         self.terms: list[_SeriesTerm] = [_SeriesTerm(x, None)]
-        self._cached_series: dict[tuple, _SeriesIndex] = {}
-        (result,) = self.inline(lambda x: [function(x)], [_SeriesIndex(0)])
-        self.result = result.term_index if isinstance(result, _SeriesIndex) else None
+        self._cached_series: dict[tuple, _TermReference] = {}
+        (result,) = self.inline_function(lambda x: [function(x)], [_TermReference(0)])
+        self.result = result.term_index if isinstance(result, _TermReference) else None
         self.constant = result
         self.evaluation_order = [] if self.result is None else self._topological_order(self.result)
 
@@ -158,8 +158,8 @@ class _Recurrences:
         assert self.result is not None
         return coefficients[self.result], histories
 
-    def indexed_history_starts(self):
-        """Return the index and coefficient 0 of each term whose history is needed."""
+    def initial_coefficients_of_histories(self):
+        """Return (index, coefficient 0) of each term of which some rule reads all earlier coefficients."""
         indices = sorted({i for term_index in self.evaluation_order for i in self.terms[term_index].history_terms})
         return [(i, self.terms[i].start) for i in indices]
 
@@ -185,23 +185,26 @@ class _Recurrences:
 
     # -- building -----------------------------------------------------------------------------------------------------
 
-    def add_term(self, start, rule: Callable | None, current_terms=(), history_terms=(), **fields) -> _SeriesIndex:
+    def add_term(self, start, rule: Callable | None, current_terms=(), history_terms=(), **fields) -> _TermReference:
+        """Append a term; return a reference to it. The arguments are the fields of :class:`_SeriesTerm`."""
         self.terms.append(_SeriesTerm(start, rule, tuple(current_terms), tuple(history_terms), **fields))
-        return _SeriesIndex(len(self.terms) - 1)
+        return _TermReference(len(self.terms) - 1)
 
     def initial_value(self, value):
-        return self.terms[value.term_index].start if isinstance(value, _SeriesIndex) else value
+        """Return coefficient 0 of a term; a constant is returned unchanged."""
+        return self.terms[value.term_index].start if isinstance(value, _TermReference) else value
 
     def starts_at_zero(self, value) -> bool:
-        return isinstance(value, _SeriesIndex) and self.terms[value.term_index].starts_at_zero
+        """Return whether a value is a term whose coefficient 0 is known to vanish."""
+        return isinstance(value, _TermReference) and self.terms[value.term_index].starts_at_zero
 
-    def inline(self, function: Callable, values: Sequence) -> list:
+    def inline_function(self, function: Callable, values: Sequence) -> list:
         """Add the terms of a function of constants and series; return its results, constants or series, as a list."""
         avals = [jax.ShapeDtypeStruct(np.shape(a), jnp.result_type(a)) for a in map(self.initial_value, values)]
         closed_jaxpr = jax.make_jaxpr(function)(*avals)
-        return self.evaluate_jaxpr(closed_jaxpr.jaxpr, closed_jaxpr.consts, values)
+        return self.add_jaxpr_terms(closed_jaxpr.jaxpr, closed_jaxpr.consts, values)
 
-    def evaluate_jaxpr(self, jaxpr, consts: Sequence, values: Sequence) -> list:
+    def add_jaxpr_terms(self, jaxpr, consts: Sequence, values: Sequence) -> list:
         """Add the terms of a jaxpr; return its results, which are series, or arrays if constant."""
         env = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *values), strict=True))
 
@@ -216,7 +219,7 @@ class _Recurrences:
             elif has_powers and all(map(_is_small_constant, arguments)):
                 with jax.ensure_compile_time_eval():  # it may become an exponent, whose value selects the rule
                     results = _evaluate_equation(eqn, arguments)
-            elif not any(isinstance(value, _SeriesIndex) for value in arguments) or not any(
+            elif not any(isinstance(value, _TermReference) for value in arguments) or not any(
                 map(_is_inexact, eqn.outvars)
             ):
                 results = _evaluate_equation(eqn, map(self.initial_value, arguments))  # tests use the initial values
@@ -239,7 +242,7 @@ def _initial_value_only_rule(recurrences: _Recurrences, eqn, values) -> list:
 
 def _linear_rule(recurrences: _Recurrences, eqn, values) -> list:
     """Return the series of a primitive that is linear in all real arguments together, coefficient by coefficient."""
-    series_indices = [value.term_index for value in values if isinstance(value, _SeriesIndex)]
+    series_indices = [value.term_index for value in values if isinstance(value, _TermReference)]
 
     def rule(n, n_float, current, history, output_number):
         coefficients = iter(current)
@@ -256,24 +259,26 @@ def _linear_rule(recurrences: _Recurrences, eqn, values) -> list:
 def _next_coefficient_or_zero(value, coefficients):
     """Return the next Taylor coefficient, of order one or more, from the iterator ``coefficients``; zero for a
     constant."""
-    if isinstance(value, _SeriesIndex):
+    if isinstance(value, _TermReference):
         return next(coefficients)
     return jnp.zeros_like(value) if jnp.issubdtype(jnp.result_type(value), jnp.inexact) else value
 
 
 def _select_output(rule: Callable, output_index: int) -> Callable:
+    """Return the rule that computes one output of an equation, from a rule with the index of the output."""
     return lambda *arguments: rule(*arguments, output_index)
 
 
 def _bilinear_rule(recurrences: _Recurrences, eqn, values) -> list:
+    """Return the series of a primitive that is linear in each of two arguments: a Cauchy product."""
     (start,) = _evaluate_equation(eqn, map(recurrences.initial_value, values))
     a, b = values
-    if isinstance(a, _SeriesIndex) and isinstance(b, _SeriesIndex):
+    if isinstance(a, _TermReference) and isinstance(b, _TermReference):
         # coefficient n of a factor is multiplied by coefficient 0 of the other one
         current_terms = [x.term_index for x, y in ((a, b), (b, a)) if not recurrences.starts_at_zero(y)]
 
         def rule(n, n_float, current, history):
-            return cauchy_product(lambda *pair: _evaluate_equation(eqn, pair)[0], history[0], history[1], n)
+            return cauchy_product_coefficient(lambda *pair: _evaluate_equation(eqn, pair)[0], history[0], history[1], n)
 
         return [
             recurrences.add_term(
@@ -284,7 +289,7 @@ def _bilinear_rule(recurrences: _Recurrences, eqn, values) -> list:
                 starts_at_zero=recurrences.starts_at_zero(a) or recurrences.starts_at_zero(b),
             )
         ]
-    series = a if isinstance(a, _SeriesIndex) else b
+    series = a if isinstance(a, _TermReference) else b
 
     def linear_rule(n, n_float, current, history):
         return _evaluate_equation(eqn, [current[0] if value is series else value for value in values])[0]
@@ -296,14 +301,14 @@ def _bilinear_rule(recurrences: _Recurrences, eqn, values) -> list:
     ]
 
 
-def _solve_bilinear(recurrences: _Recurrences, start, product: Callable, solve: Callable, a: _SeriesIndex, b) -> list:
+def _solve_bilinear(recurrences: _Recurrences, start, product: Callable, solve: Callable, a: _TermReference, b) -> list:
     """Return the series c with ``product(a, c) = b``; ``solve(rhs)`` solves this for coefficient 0 of a."""
-    is_series, starts_at_zero = isinstance(b, _SeriesIndex), recurrences.starts_at_zero(b)
+    is_series, starts_at_zero = isinstance(b, _TermReference), recurrences.starts_at_zero(b)
     current_terms = [*([b.term_index] if is_series else ()), *(() if starts_at_zero else (a.term_index,))]
 
     def rule(n, n_float, current, history):
         # coefficient n of c is still zero here
-        lower_terms = cauchy_product(product, history[0], history[1], n)
+        lower_terms = cauchy_product_coefficient(product, history[0], history[1], n)
         return solve(current[0] - lower_terms if is_series else -lower_terms)
 
     return [
@@ -314,8 +319,9 @@ def _solve_bilinear(recurrences: _Recurrences, start, product: Callable, solve: 
 
 
 def _division_rule(recurrences: _Recurrences, eqn, values) -> list:
+    """Return the series of a quotient a / b, from the product of b and the quotient."""
     a, b = values
-    if not isinstance(b, _SeriesIndex):
+    if not isinstance(b, _TermReference):
         return _bilinear_rule(recurrences, eqn, values)
     divisor_start = recurrences.initial_value(b)
     return _solve_bilinear(
@@ -339,8 +345,8 @@ def _linear_solve_rule(recurrences: _Recurrences, eqn, values) -> list:
             jax.vmap(lambda basis_vector: product(*matvec_constants, basis_vector.reshape(shape))[0].ravel())(basis)
         ]
 
-    (matrix,) = recurrences.inline(matrix_columns, values[: lengths.matvec])
-    if not isinstance(matrix, _SeriesIndex):
+    (matrix,) = recurrences.inline_function(matrix_columns, values[: lengths.matvec])
+    if not isinstance(matrix, _TermReference):
         return _linear_rule(recurrences, eqn, values)  # linear in b; the other values are constants of the other jaxprs
 
     def solve(rhs):
@@ -355,7 +361,7 @@ def _linear_solve_rule(recurrences: _Recurrences, eqn, values) -> list:
 def _triangular_solve_rule(recurrences: _Recurrences, eqn, values) -> list:
     """Return the series of ``triangular_solve``, which reads one triangle of the matrix."""
     a, b = values
-    if not isinstance(a, _SeriesIndex):
+    if not isinstance(a, _TermReference):
         return _bilinear_rule(recurrences, eqn, values)
     params, matrix_start = eqn.params, recurrences.initial_value(a)
 
@@ -372,27 +378,27 @@ def _triangular_solve_rule(recurrences: _Recurrences, eqn, values) -> list:
     return _solve_bilinear(recurrences, solve(recurrences.initial_value(b)), product, solve, a, b)
 
 
-def _derivative_rule(recurrences: _Recurrences, eqn, values) -> list:
+def _smooth_primitive_rule(recurrences: _Recurrences, eqn, values) -> list:
     """Return the series ``y = F(a, b, ...)`` of a smooth primitive, from ``D y = dF(D a, D b, ...)`` by JAX's rule."""
     (start,) = _evaluate_equation(eqn, map(recurrences.initial_value, values))
-    key = (eqn.primitive.name, repr(eqn.params), tuple(value for value in values if isinstance(value, _SeriesIndex)))
+    key = (eqn.primitive.name, repr(eqn.params), tuple(value for value in values if isinstance(value, _TermReference)))
     is_all_series = len(key[2]) == len(values)
     if is_all_series and key in recurrences._cached_series:
         return [recurrences._cached_series[key]]  # also inside its own rule: the derivative of exp(a) is exp(a)
     y = recurrences.add_term(start, None)
     if is_all_series:
         recurrences._cached_series[key] = y
-    rates = [_euler_derivative(recurrences, value) for value in values if isinstance(value, _SeriesIndex)]
+    rates = [_apply_euler_operator(recurrences, value) for value in values if isinstance(value, _TermReference)]
     if eqn.primitive.name == "pow":
-        (euler_derivative,) = _power_derivative(recurrences, y, *values)
+        (euler_derivative,) = _euler_operator_of_power(recurrences, y, *values)
     else:
 
-        def tangent(*arguments):
+        def evaluate_tangent(*arguments):
             rate_values = iter(arguments[len(values) :])
-            tangents = tuple(next(rate_values) if isinstance(v, _SeriesIndex) else jnp.zeros_like(v) for v in values)
+            tangents = tuple(next(rate_values) if isinstance(v, _TermReference) else jnp.zeros_like(v) for v in values)
             return [jax.jvp(lambda *a: _evaluate_equation(eqn, a)[0], arguments[: len(values)], tangents)[1]]
 
-        (euler_derivative,) = recurrences.inline(tangent, [*values, *rates])
+        (euler_derivative,) = recurrences.inline_function(evaluate_tangent, [*values, *rates])
     recurrences.terms[y.term_index] = _SeriesTerm(
         start, lambda n, n_float, current, history: current[0] / n_float, (euler_derivative.term_index,)
     )
@@ -402,13 +408,13 @@ def _derivative_rule(recurrences: _Recurrences, eqn, values) -> list:
 def _power_rule(recurrences: _Recurrences, eqn, values) -> list:
     """Return the series ``a ** p``, by products for an integer p, since ``p D a / a`` is inaccurate near a = 0."""
     a, p = values
-    if not isinstance(a, _SeriesIndex) or isinstance(p, _SeriesIndex):
-        return _derivative_rule(recurrences, eqn, values)
+    if not isinstance(a, _TermReference) or isinstance(p, _TermReference):
+        return _smooth_primitive_rule(recurrences, eqn, values)
     if _is_small_constant(p):
         exponents: Any = np.asarray(p)
         integers = [int(n) for n in np.unique(exponents) if float(n).is_integer() and abs(n) <= MAX_INTEGER_EXPONENT]
         if len(integers) == 1 and (exponents == integers[0]).all():
-            return recurrences.inline(lambda x: [_power_by_squaring(x, integers[0])], [a])
+            return recurrences.inline_function(lambda x: [_power_by_squaring(x, integers[0])], [a])
     else:  # the exponent is a parameter
         exponents, integers = p, list(range(MAX_INTEGER_PARAMETER + 1))
 
@@ -417,12 +423,12 @@ def _power_rule(recurrences: _Recurrences, eqn, values) -> list:
             result = jnp.where(exponents == n, _power_by_squaring(x, n), result)
         return [result]
 
-    return recurrences.inline(replace_integer_powers, [a, *_derivative_rule(recurrences, eqn, values)])
+    return recurrences.inline_function(replace_integer_powers, [a, *_smooth_primitive_rule(recurrences, eqn, values)])
 
 
 def _is_small_constant(value) -> bool:
     """Return whether a value is a number, or a few numbers, known at trace time."""
-    return not isinstance(value, _SeriesIndex | jax.core.Tracer) and np.size(value) <= MAX_CONSTANT_EXPONENTS
+    return not isinstance(value, _TermReference | jax.core.Tracer) and np.size(value) <= MAX_CONSTANT_EXPONENTS
 
 
 MAX_CONSTANT_EXPONENTS = 64
@@ -435,37 +441,43 @@ MAX_INTEGER_PARAMETER = 6
 """Largest integer exponent, given by a parameter, for which a power is written as products."""
 
 
-def _euler_derivative(recurrences: _Recurrences, a: _SeriesIndex) -> _SeriesIndex:
+def _apply_euler_operator(recurrences: _Recurrences, a: _TermReference) -> _TermReference:
+    """Add the series of ``D a = t da/dt``, whose coefficient n is n times that of a; return its term."""
     zero = jnp.zeros_like(recurrences.initial_value(a))
     return recurrences.add_term(
         zero, lambda n, n_float, current, history: n_float * current[0], (a.term_index,), starts_at_zero=True
     )
 
 
-def _power_derivative(recurrences: _Recurrences, y: _SeriesIndex, a, p) -> list:
-    """Return the Euler derivative ``D y = y (p D a / a + log(a) D p)`` of ``y = a**p``."""
-    if not isinstance(p, _SeriesIndex):
-        return recurrences.inline(
-            lambda y, a, p, da: [y * (p * (da / a))], [y, a, p, _euler_derivative(recurrences, a)]
+def _euler_operator_of_power(recurrences: _Recurrences, y: _TermReference, a, p) -> list:
+    """Add the series of ``D y = y (p D a / a + log(a) D p)`` for ``y = a**p``; return its term in a list."""
+    if not isinstance(p, _TermReference):
+        return recurrences.inline_function(
+            lambda y, a, p, da: [y * (p * (da / a))], [y, a, p, _apply_euler_operator(recurrences, a)]
         )
-    if not isinstance(a, _SeriesIndex):
-        return recurrences.inline(
-            lambda y, a, p, dp: [y * (jnp.log(a) * dp)], [y, a, p, _euler_derivative(recurrences, p)]
+    if not isinstance(a, _TermReference):
+        return recurrences.inline_function(
+            lambda y, a, p, dp: [y * (jnp.log(a) * dp)], [y, a, p, _apply_euler_operator(recurrences, p)]
         )
-    rates = _euler_derivative(recurrences, a), _euler_derivative(recurrences, p)
-    return recurrences.inline(lambda y, a, p, da, dp: [y * (p * (da / a) + jnp.log(a) * dp)], [y, a, p, *rates])
+    rates = _apply_euler_operator(recurrences, a), _apply_euler_operator(recurrences, p)
+    return recurrences.inline_function(
+        lambda y, a, p, da, dp: [y * (p * (da / a) + jnp.log(a) * dp)], [y, a, p, *rates]
+    )
 
 
 def _make_rewriting_rule(function: Callable) -> Callable:
     """Return the rule that writes a primitive in terms of others: ``function(parameters, *arguments)``."""
-    return lambda recurrences, eqn, values: recurrences.inline(lambda *a: [function(eqn.params, *a)], values)
+    return lambda recurrences, eqn, values: recurrences.inline_function(lambda *a: [function(eqn.params, *a)], values)
 
 
 def _integer_power_expression(params, x):
+    """Return ``integer_pow`` of x, with the exponent among the parameters, as products."""
     return _power_by_squaring(x, params["y"])
 
 
 def _power_by_squaring(x, exponent: int):
+    """Return ``x**exponent`` by repeated squaring."""
+
     def power(n: int):
         if n == 1:
             return x
@@ -478,42 +490,44 @@ def _power_by_squaring(x, exponent: int):
 
 
 def _call_rule(recurrences: _Recurrences, eqn, values) -> list:
+    """Return the series of the results of a call, from the jaxpr that it calls."""
     inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
     jaxpr, consts = (inner.jaxpr, inner.consts) if isinstance(inner, ClosedJaxpr) else (inner, ())
-    return recurrences.evaluate_jaxpr(jaxpr, consts, values)
+    return recurrences.add_jaxpr_terms(jaxpr, consts, values)
 
 
 def _cond_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """Return the Taylor series of ``cond``: that of the branch which the point of expansion selects."""
+    """Return the Taylor series of the branch of a ``cond`` that the point of expansion selects."""
     branch_index, *values = values
-    results = [recurrences.evaluate_jaxpr(branch.jaxpr, branch.consts, values) for branch in eqn.params["branches"]]
+    results = [recurrences.add_jaxpr_terms(branch.jaxpr, branch.consts, values) for branch in eqn.params["branches"]]
 
     def selected_case(index, *cases):
         index = jnp.clip(jnp.asarray(index, dtype=jnp.int32), 0, len(cases) - 1)
         return [jax.lax.select_n(index, *cases)]
 
     return [
-        recurrences.inline(selected_case, [recurrences.initial_value(branch_index), *cases])[0]
+        recurrences.inline_function(selected_case, [recurrences.initial_value(branch_index), *cases])[0]
         for cases in zip(*results, strict=True)
     ]
 
 
 def _scan_rule(recurrences: _Recurrences, eqn, values) -> list:
-    """Return the series of a ``scan``, pass by pass."""
+    """Return the Taylor series of the results of a ``scan``, which is unrolled pass by pass."""
     params = eqn.params
     body, n_consts = params["jaxpr"], params["num_consts"]
     carry_end = n_consts + params["num_carry"]
     consts, carry, tables = values[:n_consts], list(values[n_consts:carry_end]), values[carry_end:]
     rows, row_outputs = range(params["length"]), []
     for i in reversed(rows) if params["reverse"] else rows:
-        row_slices = [recurrences.inline(lambda x, i=i: [x[i]], [x])[0] for x in tables]
-        results = recurrences.evaluate_jaxpr(body.jaxpr, body.consts, [*consts, *carry, *row_slices])
+        row_slices = [recurrences.inline_function(lambda x, i=i: [x[i]], [x])[0] for x in tables]
+        results = recurrences.add_jaxpr_terms(body.jaxpr, body.consts, [*consts, *carry, *row_slices])
         carry = results[: len(carry)]
         row_outputs.append(results[len(carry) :])
     if params["reverse"]:
         row_outputs.reverse()
     return carry + [
-        recurrences.inline(lambda *rows: [jnp.stack(rows)], column)[0] for column in zip(*row_outputs, strict=True)
+        recurrences.inline_function(lambda *rows: [jnp.stack(rows)], column)[0]
+        for column in zip(*row_outputs, strict=True)
     ]
 
 
@@ -543,7 +557,7 @@ erf erfc erf_inv reduce_prod cumprod cholesky
 SERIES_RULES: dict[str, Callable] = {
     **dict.fromkeys(LINEAR_PRIMITIVES.split(), _linear_rule),
     **dict.fromkeys(("mul", "dot_general", "conv_general_dilated"), _bilinear_rule),
-    **dict.fromkeys(DERIVATIVE_PRIMITIVES.split(), _derivative_rule),
+    **dict.fromkeys(DERIVATIVE_PRIMITIVES.split(), _smooth_primitive_rule),
     "square": _make_rewriting_rule(lambda params, x: x * x),
     "integer_pow": _make_rewriting_rule(_integer_power_expression),
     "pow": _power_rule,
@@ -558,7 +572,7 @@ SERIES_RULES: dict[str, Callable] = {
 # -- helpers ----------------------------------------------------------------------------------------------------------
 
 
-def cauchy_product(product: Callable, a, b, n) -> jax.Array:
+def cauchy_product_coefficient(product: Callable, a, b, n) -> jax.Array:
     """Return ``sum_k product(a[k], b[n - k])`` for k from 0 to n; coefficients beyond n are zero."""
     n_coefficients = a.shape[0]
     window = jax.lax.dynamic_slice_in_dim(jnp.concatenate([jnp.zeros_like(b), b]), n + 1, n_coefficients)
@@ -566,6 +580,7 @@ def cauchy_product(product: Callable, a, b, n) -> jax.Array:
 
 
 def _store_coefficient(history, coefficient, n):
+    """Return an array of coefficients with coefficient n replaced."""
     return jax.lax.dynamic_update_index_in_dim(history, coefficient, n, 0)
 
 

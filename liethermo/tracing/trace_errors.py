@@ -43,8 +43,8 @@ JAX_ERROR_REMEDIES = {
 """Cause and remedy for each error that JAX raises if a traced value is used as a number."""
 
 
-def trace_error_message(subject: str, error: BaseException, cure: str = "") -> str:
-    """Return a message that says why a function could not be evaluated, and what to do.
+def trace_error_message(subject: str, error: BaseException, default_advice: str = "") -> str:
+    """Return the message of the error that a function cannot be traced: subject, cause and remedy.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def trace_error_message(subject: str, error: BaseException, cure: str = "") -> s
         Names the function and its arguments, such as "the energy could not be evaluated on a state of shape (3,)".
     error : exception
         The exception that a call with traced arrays has raised.
-    cure : str
+    default_advice : str
         Advice for an unknown error.
     """
     for kind, (cause, remedy) in JAX_ERROR_REMEDIES.items():
@@ -62,7 +62,7 @@ def trace_error_message(subject: str, error: BaseException, cure: str = "") -> s
     if isinstance(error, FunctionError):
         return f"{subject}: {error}"
     message = f"{subject}: {type(error).__name__}: {error}".rstrip(".")
-    return f"{message}. {cure}" if cure else message
+    return f"{message}. {default_advice}" if default_advice else message
 
 
 def _user_line_in_parentheses(error: BaseException) -> str:

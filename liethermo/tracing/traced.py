@@ -27,6 +27,7 @@ from manifolds._pytree_module import Module
 from ..errors import FunctionError
 from .index_check import check_indices
 from .lifting import ConstantLifter
+from .short_form import callable_name
 from .trace_errors import check_not_none, check_precision
 
 
@@ -66,8 +67,8 @@ _traced_programs: weakref.WeakValueDictionary[Hashable, TracedProgram] = weakref
 _lock = threading.Lock()
 
 
-class _Label:
-    """A name that does not affect comparisons: all labels are equal."""
+class _NonComparingLabel:
+    """A name for messages that does not affect comparisons: all labels are equal."""
 
     def __init__(self, name: str):
         self.name = name
@@ -76,7 +77,7 @@ class _Label:
         return self.name
 
     def __eq__(self, other) -> bool:
-        return isinstance(other, _Label)
+        return isinstance(other, _NonComparingLabel)
 
     def __hash__(self) -> int:
         return 0
@@ -90,13 +91,13 @@ class TracedFunction(Module):
     numbers : tuple of arrays
         The Python numbers in one array, then the arrays that the function closes over.
     program : TracedProgram
-    label : _Label
+    label : _NonComparingLabel
         Name of the function, for messages.
     """
 
     numbers: tuple[jax.Array, ...]
     program: TracedProgram = eqx.field(static=True)
-    label: _Label = eqx.field(static=True)
+    label: _NonComparingLabel = eqx.field(static=True)
 
     @property
     def __name__(self) -> str:
@@ -112,21 +113,23 @@ class TracedFunction(Module):
                 f"got {', '.join(str(np.shape(a)) for a in arrays)}"
             )
         values = [*self.numbers, *(a.astype(b.dtype) for a, b in zip(arrays, expected_avals, strict=True))]
-        run = _run_forward_differentiable if self.program.has_while_loop else _run_program
+        run = _run_with_forward_mode_derivatives if self.program.has_while_loop else _run_program
         return jax.tree_util.tree_unflatten(self.program.result_structure, run(self.program, values))
 
 
 def _run_program(program: TracedProgram, values: Sequence) -> list:
+    """Return the results of a program for its numbers and arguments; the first value holds all Python numbers."""
     number_array, *arrays = values
     scalars = [jax.lax.squeeze(jax.lax.slice(number_array, (i,), (i + 1,)), (0,)) for i in range(number_array.shape[0])]
     return jaxpr_as_fun(program.closed_jaxpr)(*scalars, *arrays)
 
 
-def _run_forward_differentiable(program: TracedProgram, values: Sequence) -> list:
-    return _reverse_by_forward_mode(lambda *values: _run_program(program, values))(*values)
+def _run_with_forward_mode_derivatives(program: TracedProgram, values: Sequence) -> list:
+    """Return the results of a program with a loop of unknown length, whose derivatives JAX takes in forward mode."""
+    return _with_forward_mode_derivatives(lambda *values: _run_program(program, values))(*values)
 
 
-def _reverse_by_forward_mode(function: Callable) -> Callable:
+def _with_forward_mode_derivatives(function: Callable) -> Callable:
     """Return a function whose derivatives are computed in forward mode, also where JAX asks for reverse mode.
 
     A loop of unknown length cannot be differentiated in reverse mode. The tangent is the Jacobian, computed in forward
@@ -135,11 +138,11 @@ def _reverse_by_forward_mode(function: Callable) -> Callable:
     """
 
     @jax.custom_jvp
-    def called(*values):
+    def evaluate(*values):
         return function(*values)
 
-    @called.defjvp
-    def rule(values, tangents):
+    @evaluate.defjvp
+    def jvp_rule(values, tangents):
         values, tangents = tuple(map(jnp.asarray, values)), tuple(map(jnp.asarray, tangents))
         inexact_indices = [i for i, v in enumerate(values) if jnp.issubdtype(v.dtype, jnp.inexact)]
 
@@ -149,23 +152,23 @@ def _reverse_by_forward_mode(function: Callable) -> Callable:
                 full_values[i] = v
             return function(*full_values)
 
-        def tangent(output, columns):
+        def directional_derivative(columns):
             terms = [
                 jnp.tensordot(column, tangents[i], tangents[i].ndim)
                 for i, column in zip(inexact_indices, columns, strict=True)
             ]
             return sum(terms[1:], terms[0])
 
-        jacobians = _reverse_by_forward_mode(
+        jacobians = _with_forward_mode_derivatives(
             lambda *inexact_arrays: jax.tree_util.tree_leaves(
                 jax.jacfwd(evaluate_inexact, tuple(range(len(inexact_indices))))(*inexact_arrays)
             )
         )(*(values[i] for i in inexact_indices))
-        outputs = called(*values)
+        outputs = evaluate(*values)
         columns = [jacobians[k * len(inexact_indices) : (k + 1) * len(inexact_indices)] for k in range(len(outputs))]
-        return outputs, [tangent(f, c) for f, c in zip(outputs, columns, strict=True)]
+        return outputs, list(map(directional_derivative, columns))
 
-    return called
+    return evaluate
 
 
 # -- conversion -------------------------------------------------------------------------------------------------------
@@ -174,7 +177,7 @@ def _reverse_by_forward_mode(function: Callable) -> Callable:
 def trace_function(function: Callable, *arguments) -> TracedFunction:
     """Trace a function of arrays of given shapes (``jax.ShapeDtypeStruct``); return it as a pytree of its numbers."""
     is_library_code = is_library_object(function)
-    name = getattr(function, "__name__", type(function).__name__)
+    name = callable_name(function)
 
     def evaluate(*values):  # a new function object: JAX caches traces by it, and globals that it reads may change
         result = function(*values)
@@ -197,7 +200,7 @@ def trace_function(function: Callable, *arguments) -> TracedFunction:
             program = _traced_programs[key] = TracedProgram(
                 ClosedJaxpr(jaxpr, constants), structure, avals, lifter.has_while_loop
             )
-    return TracedFunction(numbers, program, _Label(name))
+    return TracedFunction(numbers, program, _NonComparingLabel(name))
 
 
 def _defining_module(function: Callable) -> str:
@@ -210,7 +213,7 @@ def is_library_object(function: Any) -> bool:
     return _defining_module(function).split(".")[0] in ("liethermo", "manifolds")
 
 
-def _check_indices_of(tree: Any, example_use: Callable, shapes: Sequence[tuple[int, ...]]) -> None:
+def _check_indices_in_use(tree: Any, example_use: Callable, shapes: Sequence[tuple[int, ...]]) -> None:
     """Raise IndexOutOfRangeError if a user's object has a constant index out of range; skip what cannot be traced."""
     try:
         closed_jaxpr = jax.make_jaxpr(lambda *a: example_use(tree, *a))(
@@ -261,14 +264,14 @@ def _trace_with_recorders(
     recorders = {id(leaf): _CallRecorder(leaf) for leaf in leaves if is_plain_function(leaf)}
     number_indices = [i for i, leaf in enumerate(leaves) if type(leaf) is number_type]
 
-    def use_leaves(numbers, *arguments):
+    def run_example_use(numbers, *arguments):
         recorded_leaves = [recorders.get(id(leaf), leaf) for leaf in leaves]
         for i, value in zip(number_indices, numbers, strict=True):
             recorded_leaves[i] = value
         return example_use(jax.tree_util.tree_unflatten(structure, recorded_leaves), *arguments)
 
     scalar, arguments = jax.ShapeDtypeStruct((), jnp.float64), [jax.ShapeDtypeStruct(s, jnp.float64) for s in shapes]
-    closed_jaxpr, result_shapes = jax.make_jaxpr(use_leaves, return_shape=True)(
+    closed_jaxpr, result_shapes = jax.make_jaxpr(run_example_use, return_shape=True)(
         [scalar for _ in number_indices], *arguments
     )
     check_indices(closed_jaxpr)
@@ -281,8 +284,8 @@ def _trace_with_recorders(
     return jax.tree_util.tree_unflatten(structure, traced_leaves), result_shapes
 
 
-def has_plain_functions(tree: Any, is_leaf: Callable | None = None) -> bool:
-    """Return whether a pytree has plain functions or Python floats among its leaves."""
+def has_plain_functions_or_floats(tree: Any, is_leaf: Callable | None = None) -> bool:
+    """Return whether a pytree has plain functions, which are to be traced, or Python floats among its leaves."""
     leaves = jax.tree_util.tree_leaves(tree, is_leaf=is_leaf)
     return any(is_plain_function(leaf) or type(leaf) is float for leaf in leaves)
 
@@ -293,9 +296,9 @@ def trace_callables(tree: Any, example_use: Callable, *shapes: tuple[int, ...], 
     A tree without plain functions and floats is returned unchanged; an object of the user's is checked for constant
     indices out of range.
     """
-    if not has_plain_functions(tree, is_leaf):
+    if not has_plain_functions_or_floats(tree, is_leaf):
         if not is_library_object(tree):
-            _check_indices_of(tree, example_use, shapes)
+            _check_indices_in_use(tree, example_use, shapes)
         return tree
     return trace_callables_and_result_shapes(tree, example_use, *shapes, is_leaf=is_leaf)[0]
 
@@ -304,7 +307,7 @@ class _CallRecorder:
     """A plain function that traces itself for the shapes of the arguments with which it is called."""
 
     def __init__(self, function: Callable):
-        self.function, self.__name__ = function, getattr(function, "__name__", type(function).__name__)
+        self.function, self.__name__ = function, callable_name(function)
         self._traced_functions: dict[tuple, TracedFunction] = {}
         self._is_called_otherwise = False
 

@@ -55,6 +55,7 @@ def rational_array(values) -> RationalArray | None:
 
 
 def _recognize_fraction(value) -> Fraction | None:
+    """Return a number as a fraction if it equals one of denominator up to MAX_DENOMINATOR; otherwise None."""
     if isinstance(value, Rational):
         return Fraction(value)
     if isinstance(value, np.integer):

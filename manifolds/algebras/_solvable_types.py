@@ -67,10 +67,10 @@ def jordan_blocks(matrix: np.ndarray) -> list[JordanBlock]:
         return [JordanBlock(0.0, 1)] * n
     blocks = []
     for eigenvalue, multiplicity in distinct_eigenvalues(matrix):
-        shifted = values / scale - eigenvalue / scale * np.eye(n)
+        shifted_matrix = values / scale - eigenvalue / scale * np.eye(n)
         power, ranks = np.eye(n, dtype=complex), [n]
         for _ in range(multiplicity + 1):
-            power = power @ shifted
+            power = power @ shifted_matrix
             ranks.append(_numerical_rank(power))
         if n - ranks[-1] != multiplicity:
             raise AmbiguousRoundingError(
@@ -101,23 +101,25 @@ def _cluster_eigenvalues(eigenvalues: np.ndarray, scale: float) -> list[tuple[co
     groups: list[list[complex]] = []
     for value in sorted(eigenvalues, key=lambda z: (z.real, z.imag)):
         groups.append([value])
-    bound = CLUSTER_ROUNDING ** (1.0 / len(eigenvalues)) * scale
-    merged = True
-    while merged:
-        merged = False
+    max_distance = CLUSTER_ROUNDING ** (1.0 / len(eigenvalues)) * scale
+    has_merged = True
+    while has_merged:
+        has_merged = False
         for i in range(len(groups)):
             for j in range(i):
-                if min(abs(a - b) for a in groups[i] for b in groups[j]) < bound:
+                if min(abs(a - b) for a in groups[i] for b in groups[j]) < max_distance:
                     groups[j] += groups.pop(i)
-                    merged = True
+                    has_merged = True
                     break
-            if merged:
+            if has_merged:
                 break
     for group in groups:
         mean = sum(group) / len(group)
-        spread = max(abs(value - mean) for value in group)
-        if spread > CLUSTER_ROUNDING ** (1.0 / len(group)) * scale:
-            raise AmbiguousRoundingError(f"{len(group)} eigenvalues differ by {spread:.1e}, which may be rounding")
+        max_deviation = max(abs(value - mean) for value in group)
+        if max_deviation > CLUSTER_ROUNDING ** (1.0 / len(group)) * scale:
+            raise AmbiguousRoundingError(
+                f"{len(group)} eigenvalues differ by {max_deviation:.1e}, which may be rounding"
+            )
     return [(complex(sum(group) / len(group)), len(group)) for group in groups]
 
 
@@ -148,11 +150,11 @@ def squarefree_factors(polynomial: Coefficients) -> list[tuple[Coefficients, int
     divisor = _polynomial_gcd(polynomial, _polynomial_derivative(polynomial))
     remaining, multiplicity = _polynomial_divide(polynomial, divisor)[0], 1
     while len(remaining) > 1:
-        common = _polynomial_gcd(remaining, divisor)
-        factor = _polynomial_divide(remaining, common)[0]
+        common_divisor = _polynomial_gcd(remaining, divisor)
+        factor = _polynomial_divide(remaining, common_divisor)[0]
         if len(factor) > 1:
             factors.append((factor, multiplicity))
-        remaining, divisor = common, _polynomial_divide(divisor, common)[0]
+        remaining, divisor = common_divisor, _polynomial_divide(divisor, common_divisor)[0]
         multiplicity += 1
     return factors
 
@@ -255,8 +257,8 @@ def _normalize_by_largest(values: list[float]) -> tuple[float, ...]:
     candidates = []
     for i, value in enumerate(values):
         if abs(value) > top * (1.0 - 1e-9):
-            others = [ratio_or_zero(other, value) for j, other in enumerate(values) if j != i]
-            candidates.append(tuple(sorted(others, reverse=True)))
+            ratios = [ratio_or_zero(other, value) for j, other in enumerate(values) if j != i]
+            candidates.append(tuple(sorted(ratios, reverse=True)))
     return max(candidates)
 
 
@@ -285,12 +287,12 @@ def _type_of_line_acting_on_abelian(blocks: list[JordanBlock]) -> Summand:
         if sizes == (2, 1, 1):
             return _make_summand("A5,8", c=_normalize_by_largest(values[1:])[0])
         return ({2: "A4,3", 3: "A5,10"}[sizes[0]], ())
-    others = sorted((ratio_or_zero(value, head) for value in values[1:]), reverse=True)
+    ratios = sorted((ratio_or_zero(value, head) for value in values[1:]), reverse=True)
     if sizes == (2, 1):
-        return _make_summand("A4,2", a=others[0])
+        return _make_summand("A4,2", a=ratios[0])
     if sizes == (3, 1):
-        return _make_summand("A5,11", c=others[0])
-    return _make_summand("A5,9", b=others[0], c=others[1])
+        return _make_summand("A5,11", c=ratios[0])
+    return _make_summand("A5,9", b=ratios[0], c=ratios[1])
 
 
 def _type_of_diagonal_action(ratios: tuple[float, ...]) -> Summand:
@@ -332,8 +334,8 @@ def _type_of_rotations(pairs: list[JordanBlock]) -> Summand:
         p = abs(ratio_or_zero(pairs[0].eigenvalue.real, pairs[0].eigenvalue.imag))
         return ("A3,6", ()) if is_zero(p) else _make_summand("A3,7", a=p)
     candidates = []
-    for first, second in (pairs, pairs[::-1]):
-        z, w = first.eigenvalue, second.eigenvalue
+    for pair_1, pair_2 in (pairs, pairs[::-1]):
+        z, w = pair_1.eigenvalue, pair_2.eigenvalue
         if z.imag > w.imag * (1.0 - 1e-9):
             for sign in (1, -1):
                 scale = sign * z.imag
@@ -441,11 +443,11 @@ def _first_clear_type(
     matrices: list[np.ndarray], recognise: Callable[[list[np.ndarray], np.ndarray], Summand]
 ) -> Summand:
     """Return the type that a function finds from two matrices and a generic combination of them."""
-    first, second = (matrix / (np.abs(matrix).max() or 1.0) for matrix in matrices)
+    matrix_1, matrix_2 = (matrix / (np.abs(matrix).max() or 1.0) for matrix in matrices)
     reasons = []
     for angle in GENERIC_ANGLES:
         try:
-            return recognise([first, second], np.cos(angle) * first + np.sin(angle) * second)
+            return recognise([matrix_1, matrix_2], np.cos(angle) * matrix_1 + np.sin(angle) * matrix_2)
         except AmbiguousRoundingError as error:
             reasons.append(error)
     raise reasons[0]

@@ -197,8 +197,8 @@ def complement(rows: np.ndarray, space_rows: np.ndarray, name: str) -> np.ndarra
         projected_rows = space_rows - space_rows @ row_space(rows, name).T @ row_space(rows, name)
         return row_space(projected_rows, name)
     n_rows = len(rows)
-    stacked = fraction_rows(np.vstack([rows, space_rows]))
-    _, independent = row_echelon(stacked.T)
+    stacked_rows = fraction_rows(np.vstack([rows, space_rows]))
+    _, independent = row_echelon(stacked_rows.T)
     return space_rows[[i - n_rows for i in independent if i >= n_rows]]
 
 
@@ -206,8 +206,8 @@ def coordinates(basis: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Return c, shape (k, len(basis)), with ``c @ basis = vectors``, for vectors in the span of independent rows."""
     if not is_exact(basis):
         return np.linalg.lstsq(basis.T, vectors.T, rcond=None)[0].T
-    augmented = np.hstack([fraction_rows(basis).T, fraction_rows(vectors).T])
-    echelon, pivots = row_echelon(augmented)
+    augmented_matrix = np.hstack([fraction_rows(basis).T, fraction_rows(vectors).T])
+    echelon, pivots = row_echelon(augmented_matrix)
     assert pivots == list(range(len(basis))), "the vectors are in the span of the rows"
     return echelon[:, len(basis) :].T
 
@@ -218,8 +218,8 @@ def solution(matrix: np.ndarray, right_hand_side: np.ndarray) -> np.ndarray:
         return np.linalg.lstsq(matrix, right_hand_side, rcond=None)[0]
     if not matrix.shape[1]:
         return np.zeros(0, dtype=object)
-    augmented = np.hstack([matrix, -right_hand_side[:, None]])
-    vector = next(v for v in null_space(augmented, "") if v[-1])
+    augmented_matrix = np.hstack([matrix, -right_hand_side[:, None]])
+    vector = next(v for v in null_space(augmented_matrix, "") if v[-1])
     return np.array([Fraction(entry, vector[-1]) for entry in vector[:-1]], dtype=object)
 
 

@@ -524,6 +524,7 @@ def semidirect_sum(g: LieAlgebra, representation, name: str | None = None, *, id
 
 
 def _check_representation(g: LieAlgebra, representation_matrices: np.ndarray) -> None:
+    """Raise RepresentationError unless the commutators of the matrices are those of a representation of g."""
     products = np.einsum("aij,bjk->abik", representation_matrices, representation_matrices)
     defect = (
         products - products.swapaxes(0, 1) - np.einsum("abc,cij->abij", g.structure_constants, representation_matrices)
@@ -543,6 +544,7 @@ def _check_representation(g: LieAlgebra, representation_matrices: np.ndarray) ->
 
 
 def _check_derivations(g: LieAlgebra, representation_matrices: np.ndarray, ideal: LieAlgebra) -> None:
+    """Raise RepresentationError unless every matrix is a derivation of the ideal."""
     C = ideal.structure_constants
     defect = np.einsum("ijk,alk->aijl", C, representation_matrices)  # D [u_i, u_j] - [D u_i, u_j] - [u_i, D u_j]
     defect -= np.einsum("aki,kjl->aijl", representation_matrices, C) + np.einsum(
@@ -562,6 +564,10 @@ def _check_derivations(g: LieAlgebra, representation_matrices: np.ndarray, ideal
 
 
 def _semidirect_sum_matrices(g: LieAlgebra, representation_matrices: np.ndarray) -> np.ndarray | None:
+    """Return matrices of the semidirect sum with an abelian ideal; None if g and the affine ones give none.
+
+    They are affine, shape (dim, m + 1, m + 1); beside the matrices of g if the affine ones alone are not faithful.
+    """
     m, dim = representation_matrices.shape[1], g.dim + representation_matrices.shape[1]
     affine = np.zeros((dim, m + 1, m + 1))
     affine[: g.dim, :m, :m] = representation_matrices

@@ -33,10 +33,10 @@ def constants_and_names(brackets: Mapping, basis: Iterable[str] | None) -> tuple
                     f"the bracket of {pair} has the element {name!r}, which is not in basis={names!r}; add it there"
                 )
     constants = np.full((len(names),) * 3, Fraction(0), dtype=object)
-    for (first, second), combination in table.items():
+    for (name_a, name_b), combination in table.items():
         for name, coefficient in combination.items():
-            constants[index[first], index[second], index[name]] = coefficient
-            constants[index[second], index[first], index[name]] = -coefficient
+            constants[index[name_a], index[name_b], index[name]] = coefficient
+            constants[index[name_b], index[name_a], index[name]] = -coefficient
     return constants, names
 
 
@@ -51,15 +51,15 @@ def _checked_table(brackets: Mapping) -> dict[tuple[str, str], Combination]:
     for pair, value in brackets.items():
         if not isinstance(pair, tuple) or len(pair) != 2 or not all(isinstance(name, str) for name in pair):
             raise ParameterError(f"a bracket needs a pair of names such as ('e1', 'e2'), got {pair!r}")
-        first, second = pair
+        name_a, name_b = pair
         combination = _parse_combination(value, pair)
-        if first == second and combination:
-            raise AntisymmetryError(f"[{first}, {first}] must be zero, got {value!r}. Remove this entry")
-        opposite = table.get((second, first))
-        if first != second and opposite is not None and opposite != {n: -c for n, c in combination.items()}:
+        if name_a == name_b and combination:
+            raise AntisymmetryError(f"[{name_a}, {name_a}] must be zero, got {value!r}. Remove this entry")
+        opposite = table.get((name_b, name_a))
+        if name_a != name_b and opposite is not None and opposite != {n: -c for n, c in combination.items()}:
             raise AntisymmetryError(
-                f"[{second}, {first}] = {brackets[second, first]!r} contradicts [{first}, {second}] = {value!r}: one "
-                "must be minus the other. Give one of the two only"
+                f"[{name_b}, {name_a}] = {brackets[name_b, name_a]!r} contradicts [{name_a}, {name_b}] = {value!r}: "
+                "one must be minus the other. Give one of the two only"
             )
         if opposite is None:
             table[pair] = combination

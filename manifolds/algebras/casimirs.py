@@ -482,9 +482,9 @@ def check_invariant(g: AlgebraStructure, function: Callable) -> None:
         residual = float(np.linalg.norm(np.asarray(g.ad_star(gradient, mu))))
         if not residual <= INVARIANT_TOLERANCE * scale:
             raise LieAlgebraError(
-                f"{function} is no Casimir of {g.name}: at mu = {np.round(mu, 3).tolist()}, ad* mu of its gradient has "
-                f"the size {residual:.3g}, not 0 (tolerance {INVARIANT_TOLERANCE * scale:.1g}); check the signs, and "
-                "that it is finite there",
+                f"{function} is not a Casimir of {g.name}: at mu = {np.round(mu, 3).tolist()}, ad* mu of its gradient "
+                f"has the size {residual:.3g}, not 0 (tolerance {INVARIANT_TOLERANCE * scale:.1g}). Check the signs, "
+                "and that it is finite there",
                 residual=residual,
                 tolerance=INVARIANT_TOLERANCE * scale,
             )

@@ -456,7 +456,7 @@ class LieAlgebra(StructureMethods):
             The degree of all Casimirs that are returned.
         max_degree : int, optional
             Return the Casimirs of all degrees from 1 to this one instead, by default to 4. ParameterError if both are
-            given, or one is no positive integer.
+            given, or one is not a positive integer.
         """
         if degree is not None and max_degree is not None:
             raise ParameterError("casimirs takes degree or max_degree, not both. Give one of them")

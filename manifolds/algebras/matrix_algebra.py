@@ -73,9 +73,9 @@ class MatrixAlgebra(BracketAlgebra):
     classical_data : ClassicalData
     """
 
-    def __init__(self, name: str, tables: MatrixBasis, known: ClassicalData):
-        super().__init__(name, tables.dim)
-        self.matrix_basis, self.classical_data, self.matrix_size = tables, known, tables.size
+    def __init__(self, name: str, matrix_basis: MatrixBasis, classical_data: ClassicalData):
+        super().__init__(name, matrix_basis.dim)
+        self.matrix_basis, self.classical_data, self.matrix_size = matrix_basis, classical_data, matrix_basis.size
 
     @property
     def _key(self):

@@ -114,9 +114,9 @@ class Polynomial(metaclass=ListedType):
 
     def gradient(self) -> tuple[Polynomial, ...]:
         """Return the partial derivatives by mu1, mu2, …"""
-        return tuple(self._derivative(a) for a in range(self.dim))
+        return tuple(self._partial_derivative(a) for a in range(self.dim))
 
-    def _derivative(self, component: int) -> Polynomial:
+    def _partial_derivative(self, component: int) -> Polynomial:
         terms = [
             ((*p[:component], p[component] - 1, *p[component + 1 :]), p[component] * c)
             for p, c in self.terms
@@ -297,10 +297,10 @@ class Formula:
         """Return the value at ``mu``, shape (..., dim) -> (...)."""
         mu = real_components(mu, self.dim, "mu")
         components = {name: mu[..., i] for i, name in enumerate(self.names)}
-        return eval(self._code, {"__builtins__": {}, **FUNCTIONS}, components)
+        return eval(self._compiled_code, {"__builtins__": {}, **FUNCTIONS}, components)
 
     @cached_property
-    def _code(self) -> CodeType:
+    def _compiled_code(self) -> CodeType:
         return compile(self.text, "<formula>", "eval")
 
     def __str__(self) -> str:

@@ -188,10 +188,12 @@ def constants_in_basis(g: AlgebraStructure, rows) -> tuple[np.ndarray, np.ndarra
     dependent = LieAlgebraError(f"the {g.dim} rows of a new basis of {g.name} are linearly dependent; replace some")
     if exact is not None and fractions is not None:
         P = fraction_rows(fractions.numerator) * Fraction(1, fractions.denominator)
-        augmented, pivots = row_echelon(np.hstack([P, fraction_rows(np.eye(g.dim, dtype=np.int64).astype(object))]))
+        augmented_matrix, pivots = row_echelon(
+            np.hstack([P, fraction_rows(np.eye(g.dim, dtype=np.int64).astype(object))])
+        )
         if pivots != list(range(g.dim)):
             raise dependent
-        inverse, C = augmented[:, g.dim :], exact.numerator.astype(object) * Fraction(1, exact.denominator)
+        inverse, C = augmented_matrix[:, g.dim :], exact.numerator.astype(object) * Fraction(1, exact.denominator)
     else:
         P, C = matrix.astype(np.float64), g.structure_constants
         if not np.isfinite(P).all() or np.linalg.cond(P) > 1e12:

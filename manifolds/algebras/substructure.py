@@ -106,10 +106,10 @@ def derived_ideals(work: WorkingConstants, ideal: np.ndarray | None = None) -> l
 
 def lower_central_ideals(work: WorkingConstants, ideal: np.ndarray | None = None) -> list[np.ndarray]:
     """Return rows of g, [g, g], [g, [g, g]], … until the dimension no longer falls; or those of an ideal."""
-    first = work.full_space_rows if ideal is None else ideal
-    ideals = [first]
+    full_ideal = work.full_space_rows if ideal is None else ideal
+    ideals = [full_ideal]
     while len(ideals[-1]):
-        next_ideal = work.span_of_brackets(first, ideals[-1])
+        next_ideal = work.span_of_brackets(full_ideal, ideals[-1])
         if len(next_ideal) == len(ideals[-1]):
             break
         ideals.append(next_ideal)
@@ -119,8 +119,8 @@ def lower_central_ideals(work: WorkingConstants, ideal: np.ndarray | None = None
 def radical(work: WorkingConstants) -> np.ndarray:
     """Return rows of the largest solvable ideal: the complement of [g, g] by the Killing form (Cartan)."""
     killing = np.tensordot(work.constants, work.constants, axes=([1, 2], [2, 1]))
-    derived = work.span_of_brackets(work.full_space_rows, work.full_space_rows)
-    return null_space(derived @ killing, work.name) if len(derived) else work.full_space_rows
+    derived_rows = work.span_of_brackets(work.full_space_rows, work.full_space_rows)
+    return null_space(derived_rows @ killing, work.name) if len(derived_rows) else work.full_space_rows
 
 
 def nilradical(work: WorkingConstants) -> np.ndarray:

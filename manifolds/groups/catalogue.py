@@ -175,14 +175,14 @@ def subalgebra_basis(group: MatrixGroup, spanning_matrices) -> np.ndarray:
             f"the stabilizer in {group.name} must be matrices of shape (k, {n}, {n}), got {matrices.shape}"
         )
 
-    def components(a):
+    def components_of_matrix(a):
         return np.einsum("dij,...ij->...d", basis.conj(), a).real / (np.abs(basis[0]) ** 2).sum()
 
-    def matrix(c):
+    def matrix_of_components(c):
         return np.einsum("...d,dij->...ij", c, basis)
 
-    directions = components(matrices)
-    residuals = np.abs(matrices - matrix(directions)).max(axis=(1, 2), initial=0.0)
+    directions = components_of_matrix(matrices)
+    residuals = np.abs(matrices - matrix_of_components(directions)).max(axis=(1, 2), initial=0.0)
     if (residuals > SUBALGEBRA_TOLERANCE).any():
         raise ParameterError(
             f"matrix {int(np.argmax(residuals))} of the stabilizer is not in the algebra of {group.name}: it is "
@@ -195,8 +195,8 @@ def subalgebra_basis(group: MatrixGroup, spanning_matrices) -> np.ndarray:
         )
     rows = np.linalg.qr(directions.T)[0].T
     for j, i in itertools.combinations(range(len(rows)), 2):
-        a, b = matrix(rows[i]), matrix(rows[j])
-        bracket = components(a @ b - b @ a)
+        a, b = matrix_of_components(rows[i]), matrix_of_components(rows[j])
+        bracket = components_of_matrix(a @ b - b @ a)
         if (residual := np.linalg.norm(bracket - rows.T @ (rows @ bracket))) > SUBALGEBRA_TOLERANCE:
             raise ParameterError(
                 f"the stabilizer in {group.name} is not a subalgebra: the bracket of its directions {j} and {i} is "
@@ -243,7 +243,7 @@ def horizontal_factor_coordinates(
     def to_real_vector(a):
         return jnp.concatenate([a.real.ravel(), a.imag.ravel()])
 
-    def newton_step(state):
+    def damped_newton_step(state):
         z, _, steps = state
         J, f = jax.jacfwd(lambda z: (to_real_vector(residual(z, element)),) * 2, has_aux=True)(z)
         direction = solve(J.T @ J, -(J.T @ f)[:, None])[:, 0]
@@ -256,7 +256,7 @@ def horizontal_factor_coordinates(
 
     def newton_solve(_, start):
         is_unfinished = lambda state: (state[1] > 1e-8) & (state[2] < _MAX_NEWTON_STEPS)  # noqa: E731
-        z, change, _ = jax.lax.while_loop(is_unfinished, newton_step, (start, jnp.inf, 0))
+        z, change, _ = jax.lax.while_loop(is_unfinished, damped_newton_step, (start, jnp.inf, 0))
         is_solution = (
             ((z[:d] ** 2).sum() < max_length**2) & (change <= 1e-8) & (jnp.abs(residual(z, element)).max() <= 1e-10)
         )

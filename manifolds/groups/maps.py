@@ -364,20 +364,20 @@ def fields_from_equations(function: Callable, n: int, name: str) -> dict[str, An
     scale = float(np.abs(derivative).max(initial=0.0))
     if not scale > 0.0:
         raise ParameterError("the derivative of f at the identity is zero, so it defines no algebra. Use a first power")
-    left, singular_values, _ = np.linalg.svd(derivative / scale)
+    left_vectors, singular_values, _ = np.linalg.svd(derivative / scale)
     vectors = numerical_null_space(derivative / scale, name)
     if not len(vectors):
         raise ParameterError("f has the identity as an isolated solution: the group has dimension 0")
     algebra = LieAlgebra.from_matrices(vectors.reshape(-1, n, n), name=f"algebra of {name}")
-    combinations = left[:, : int((singular_values > RANK_TOLERANCE).sum())].T
+    combinations = left_vectors[:, : int((singular_values > RANK_TOLERANCE).sum())].T
     equations = IndependentEquations(function, tuple(map(tuple, combinations.tolist())))
     x = np.random.default_rng(0).standard_normal((4, algebra.dim))
     for matrix in np.asarray(jax.scipy.linalg.expm(algebra.hat(x) / np.linalg.norm(algebra.hat(x)))):
         residual = np.abs(np.asarray(ravel_pytree(function(jnp.asarray(matrix)))[0])).max()
         if not residual <= EXPONENTIAL_TOLERANCE * max(1.0, scale):
             raise ClosureError(
-                f"the solutions of f are no group: exponentials of its algebra miss them by {residual:.3g} (tolerance "
-                f"{EXPONENTIAL_TOLERANCE * max(1.0, scale):.0e}); add the equations that are missing",
+                f"the solutions of f are not a group: exponentials of its algebra miss them by {residual:.3g} "
+                f"(tolerance {EXPONENTIAL_TOLERANCE * max(1.0, scale):.0e}). Add the equations that are missing",
                 residual=float(residual),
                 tolerance=EXPONENTIAL_TOLERANCE * max(1.0, scale),
             )

@@ -51,12 +51,12 @@ def register(*argument_tuples: tuple):
 
     def add_to_registry(constructor):
         @wraps(constructor)
-        def build(*args, **kwargs):
+        def build_catalogued_group(*args, **kwargs):
             _catalogued_groups.add(group := constructor(*args, **kwargs))
             return group
 
-        _registry.extend((build, a) for a in argument_tuples)
-        return build
+        _registry.extend((build_catalogued_group, a) for a in argument_tuples)
+        return build_catalogued_group
 
     return add_to_registry
 

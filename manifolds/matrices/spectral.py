@@ -96,10 +96,15 @@ def _simplex_quadrature(k: int, n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
     for i in range(k):
         x, w = scipy.special.roots_jacobi(n_nodes, k - 1 - i, 0)  # of the weight (1 - u)^(k - 1 - i)
         u, w = (x + 1) / 2, w / 2.0 ** (k - i)
-        repeated = np.repeat(barycentric, n_nodes, axis=0)
+        repeated_points = np.repeat(barycentric, n_nodes, axis=0)
         node_column = np.tile(u, len(barycentric))[:, None]
         barycentric = np.concatenate(
-            [repeated[:, :-1], repeated[:, -1:] * node_column, repeated[:, -1:] * (1 - node_column)], axis=1
+            [
+                repeated_points[:, :-1],
+                repeated_points[:, -1:] * node_column,
+                repeated_points[:, -1:] * (1 - node_column),
+            ],
+            axis=1,
         )
         weights = np.repeat(weights, n_nodes) * np.tile(w, len(weights))
     return barycentric, weights

@@ -209,7 +209,7 @@ def _log_jvp(primals, tangents):
 def semidefinite_factor(a) -> jax.Array:
     """Return L with ``L L^T = a``, shape (n, n), for a symmetric positive semidefinite a, by Cholesky with pivoting.
 
-    Columns whose pivot is rounding are zero. The factor is no continuous function of a.
+    Columns whose pivot is rounding are zero. The factor is not a continuous function of a.
     """
     n, columns = a.shape[-1], []
     threshold = _RANK_TOLERANCE * jnp.max(jnp.diagonal(a), initial=0.0)

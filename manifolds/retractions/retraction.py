@@ -128,6 +128,7 @@ class Retraction(metaclass=ListedABCMeta):
     def _reach(self, z, v): ...
 
     def _checked_step(self, z, v, h):
+        """Return the base point z and the tangent vector ``h v``, after a check of both."""
         z, v = self.space._checked_point_and_vectors(z, "z", v=v)
         return z, h * v
 
@@ -337,32 +338,46 @@ class _ProductCoordinates(Coordinates):
     """Coordinates of a product, factor by factor."""
 
     space: Product
-    parts: tuple[Coordinates, ...]
+    factor_coordinates: tuple[Coordinates, ...]
 
     def point(self, c):
         return self.space.join(
-            *(factor.point(component) for factor, component in zip(self.parts, self._split_components(c), strict=True))
+            *(
+                factor.point(component)
+                for factor, component in zip(self.factor_coordinates, self._split_components(c), strict=True)
+            )
         )
 
     def components(self, v):
         return self._join_components(
-            [factor.components(component) for factor, component in zip(self.parts, self.space.split(v), strict=True)]
+            [
+                factor.components(component)
+                for factor, component in zip(self.factor_coordinates, self.space.split(v), strict=True)
+            ]
         )
 
     def vector(self, c):
         return self.space.join(
-            *(factor.vector(component) for factor, component in zip(self.parts, self._split_components(c), strict=True))
+            *(
+                factor.vector(component)
+                for factor, component in zip(self.factor_coordinates, self._split_components(c), strict=True)
+            )
         )
 
     def at(self, c):
         return self._join_places(
-            [factor.at(component) for factor, component in zip(self.parts, self._split_components(c), strict=True)]
+            [
+                factor.at(component)
+                for factor, component in zip(self.factor_coordinates, self._split_components(c), strict=True)
+            ]
         )
 
     def centre(self):
-        return self._join_places([factor.centre() for factor in self.parts])
+        return self._join_places([factor.centre() for factor in self.factor_coordinates])
 
     def _join_places(self, places: list[Place]) -> Place:
+        """Return the place on the product from the places on its factors."""
+
         def lift(alpha):
             return self.space.join(
                 *(place.lift(component) for place, component in zip(places, self._split_components(alpha), strict=True))

@@ -413,4 +413,5 @@ def register_result_class(operation: str) -> Callable[[type[Space]], type[Space]
 
 
 def random_key(key_or_seed):
+    """Return a JAX random key, made from an integer seed if that is given."""
     return jax.random.key(key_or_seed) if isinstance(key_or_seed, int | np.integer) else key_or_seed

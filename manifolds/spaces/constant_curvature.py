@@ -239,6 +239,7 @@ class Sphere(Space):
 
 
 def _dot(u, v):
+    """Return the Euclidean product of vectors, shape (..., 1)."""
     return (u * v).sum(axis=-1, keepdims=True)
 
 
@@ -381,8 +382,10 @@ _DIRECTION_ROUNDING = 8 * np.finfo(float).eps
 
 
 def _minkowski_product(u, v):
+    """Return ``-u_0 v_0 + u_1 v_1 + … + u_n v_n``, shape (..., 1)."""
     return (_lower_index(u) * v).sum(axis=-1, keepdims=True)
 
 
 def _lower_index(v):
+    """Return the covector of v by the Minkowski metric: the first component changes its sign."""
     return v * np.array([-1.0] + [1.0] * (v.shape[-1] - 1))

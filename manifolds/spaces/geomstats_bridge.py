@@ -55,7 +55,7 @@ def from_geomstats(space, injectivity_radius: float | None = None) -> GeomstatsS
     from geomstats.geometry.manifold import Manifold
 
     if isinstance(space, ComplexManifold):
-        raise SpaceError(f"{_name(space)} has complex points, which are not supported")
+        raise SpaceError(f"{_geomstats_name(space)} has complex points, which are not supported")
 
     if not isinstance(space, Manifold):
         raise SpaceError(f"from_geomstats(space): space must be a geomstats manifold, got {type(space).__name__}")
@@ -64,7 +64,7 @@ def from_geomstats(space, injectivity_radius: float | None = None) -> GeomstatsS
             f"geomstats must run with NumPy, got the backend {backend.__name__}. Set GEOMSTATS_BACKEND=numpy"
         )
     if getattr(space, "metric", None) is None:
-        raise SpaceError(f"{_name(space)} has no metric: equip it with one, space.equip_with_metric(...)")
+        raise SpaceError(f"{_geomstats_name(space)} has no metric: equip it with one, space.equip_with_metric(...)")
     if injectivity_radius is not None and not injectivity_radius > 0.0:
         raise ParameterError(f"injectivity_radius must be positive, got {injectivity_radius!r}")
     bridge = GeomstatsSpace(
@@ -94,7 +94,7 @@ class GeomstatsSpace(Space):
 
     @property
     def name(self):
-        return _name(self.source)
+        return _geomstats_name(self.source)
 
     @property
     def dim(self):
@@ -255,16 +255,20 @@ class GeomstatsSpace(Space):
     ) -> list[np.ndarray]:
         """Return the arguments with the k-th displaced: a point along a geodesic, with its tangent vectors projected
         there."""
-        kinds, displaced = _KERNEL_SIGNATURES[kernel][0], list(arrays)
+        kinds, displaced_arguments = _KERNEL_SIGNATURES[kernel][0], list(arrays)
         if kinds[argument_index] != "p":
-            displaced[argument_index] = displaced[argument_index] + displacement
-            return displaced
-        displaced[argument_index] = self._evaluate_on_host("exp", displaced[argument_index], displacement)
+            displaced_arguments[argument_index] = displaced_arguments[argument_index] + displacement
+            return displaced_arguments
+        displaced_arguments[argument_index] = self._evaluate_on_host(
+            "exp", displaced_arguments[argument_index], displacement
+        )
         if argument_index == 0:
             tangent_indices = [i for i, kind in enumerate(kinds) if kind == "v"]
             for i in tangent_indices:
-                displaced[i] = self._evaluate_on_host("project_tangent", displaced[0], displaced[i])
-        return displaced
+                displaced_arguments[i] = self._evaluate_on_host(
+                    "project_tangent", displaced_arguments[0], displaced_arguments[i]
+                )
+        return displaced_arguments
 
 
 # -- kernels of geomstats, on arrays of shape (count, *shape) -----------------------------------------------------
@@ -388,16 +392,16 @@ def _log_jvp(space: GeomstatsSpace, primals, tangents):
     (x, y), (dx, dy) = primals, tangents
     v, size = _log(space, x, y), math.prod(space.shape)
 
-    def to_rows(a):
+    def flatten_points(a):
         return a.reshape(*a.shape[: a.ndim - len(space.shape)], size)
 
     exp_jacobian, projection_jacobian = (_jacobian(space, kernel, [x, v]) for kernel in ("exp", "project_tangent"))
-    dx, frame = to_rows(dx), space._frame(x)
-    exp_of_frame = jnp.einsum("...ij,...aj->...ai", exp_jacobian[..., size:], to_rows(frame))
-    remainder = to_rows(dy) - jnp.einsum(
+    dx, frame = flatten_points(dx), space._frame(x)
+    exp_of_frame = jnp.einsum("...ij,...aj->...ai", exp_jacobian[..., size:], flatten_points(frame))
+    remainder = flatten_points(dy) - jnp.einsum(
         "...ij,...j->...i", exp_jacobian[..., :size], dx
     )  # exp projects its argument, hence no D
-    dual = to_rows(space._metric_covector(space._with_frame_axis(y), space._frame(y)))
+    dual = flatten_points(space._metric_covector(space._with_frame_axis(y), space._frame(y)))
     matrix = jnp.einsum("...bi,...ai->...ba", dual, exp_of_frame)
     c = solve(matrix, jnp.einsum("...bi,...i->...b", dual, remainder)[..., None])[..., 0]
     dv = jnp.einsum("...ij,...j->...i", projection_jacobian[..., :size], dx).reshape(v.shape)
@@ -460,5 +464,6 @@ def _constant_injectivity_radius(space) -> float | None:
     return radii[0] if radii[0] == radii[1] else None
 
 
-def _name(space) -> str:
+def _geomstats_name(space) -> str:
+    """Return the name of a geomstats space for messages, such as ``"geomstats Hypersphere(2)"``."""
     return f"geomstats {type(space).__name__.strip('_')}({space.dim})"

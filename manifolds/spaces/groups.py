@@ -456,7 +456,7 @@ class SpecialEuclidean(GroupSpace):
         return affine_matrix(rotation, self.length * translation_normals[..., None])
 
     def _project_tangent(self, x, w):
-        return self._map_blocks(self.rotations._project_tangent, lambda x, w: w, x, w)
+        return self._map_rotation_and_translation(self.rotations._project_tangent, lambda x, w: w, x, w)
 
     _tangential_part = tangential_part_by_projection
 
@@ -485,29 +485,33 @@ class SpecialEuclidean(GroupSpace):
     _inner = inner_by_flat
 
     def _metric_covector(self, x, v):
-        return self._map_blocks(self.rotations._metric_covector, lambda x, v: v / self.length**2, x, v)
+        return self._map_rotation_and_translation(
+            self.rotations._metric_covector, lambda x, v: v / self.length**2, x, v
+        )
 
     def _exp(self, x, v):
-        y = self._map_blocks(self.rotations._exp, lambda x, v: x + v, x, v)
+        y = self._map_rotation_and_translation(self.rotations._exp, lambda x, v: x + v, x, v)
         return affine_matrix(y[..., :-1, :-1], y[..., :-1, -1:])
 
     def _log(self, x, y):
-        return self._map_blocks(self.rotations._log, lambda x, y: y - x, x, y)
+        return self._map_rotation_and_translation(self.rotations._log, lambda x, y: y - x, x, y)
 
     def _squared_distance(self, x, y):
         displacement = (y[..., :-1, -1] - x[..., :-1, -1]) / self.length
         return self.rotations._squared_distance(x[..., :-1, :-1], y[..., :-1, :-1]) + (displacement**2).sum(axis=-1)
 
     def _transport(self, x, v, u):
-        return self._map_blocks(self.rotations._transport, lambda x, v, u: u + jnp.zeros_like(v), x, v, u)
+        return self._map_rotation_and_translation(
+            self.rotations._transport, lambda x, v, u: u + jnp.zeros_like(v), x, v, u
+        )
 
     def _reach(self, x, v):
         return self.rotations._reach(x[..., :-1, :-1], v[..., :-1, :-1])
 
-    def _map_blocks(self, rotational, translational, *arrays):
-        """Return blocks ``[[rotational, translational], [0, 0]]`` of functions of the blocks of the arrays."""
-        rotation = rotational(*(a[..., :-1, :-1] for a in arrays))
-        translation = translational(*(a[..., :-1, -1:] for a in arrays))
+    def _map_rotation_and_translation(self, rotation_map, translation_map, *arrays):
+        """Return ``[[R, t], [0, 0]]``: R by ``rotation_map``, t by ``translation_map``, of the blocks of the arrays."""
+        rotation = rotation_map(*(a[..., :-1, :-1] for a in arrays))
+        translation = translation_map(*(a[..., :-1, -1:] for a in arrays))
         batch = jnp.broadcast_shapes(rotation.shape[:-2], translation.shape[:-2])
         top = jnp.concatenate([jnp.broadcast_to(a, (*batch, *a.shape[-2:])) for a in (rotation, translation)], axis=-1)
         return jnp.concatenate([top, jnp.zeros_like(top[..., :1, :])], axis=-2)

@@ -53,7 +53,7 @@ class LevelSet(Space):
     Raises
     ------
     SpaceError
-        If the constraints are no such functions, depend on each other, or no random array leads to a point.
+        If the constraints are not such functions, depend on each other, or no random array leads to a point.
     ParameterError
         If the shape or the metric cannot be used.
 

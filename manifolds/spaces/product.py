@@ -334,6 +334,7 @@ class Power(Space):
 
     @staticmethod
     def _join_copies(c):
+        """Return numbers of each copy, shape (..., count, m), as one array, shape (..., count m)."""
         return c.reshape(*c.shape[:-2], -1)
 
     def _minimal_correction(self, x, constraint_change):
@@ -343,6 +344,7 @@ class Power(Space):
         return self.base._correction(x, self._split_copies(constraint_change))
 
     def _split_copies(self, c):
+        """Return an array, shape (..., count m), as numbers of each copy, shape (..., count, m)."""
         return c.reshape(*c.shape[:-1], self.count, c.shape[-1] // self.count)
 
     _tangential_part = forward_to("base")
@@ -533,8 +535,10 @@ class TangentBundle(Space):
     # -- helpers ------------------------------------------------------------------------------------------------------
 
     def _position_and_vector(self, x):
+        """Return the position q and the tangent vector v of a point (q, v) of the bundle."""
         axis = -1 - len(self.base.shape)
         return tuple(jnp.take(x, i, axis=axis) for i in (0, 1))
 
     def _stack_pair(self, q, v):
+        """Return the point (q, v) of the bundle, shape ``(..., 2, *base.shape)``."""
         return jnp.stack(jnp.broadcast_arrays(q, v), axis=-1 - len(self.base.shape))

@@ -184,6 +184,7 @@ class Correlation(PositiveDefinite):
         return jnp.where(self._inside(y)[..., None, None], y, jnp.nan)
 
     def _with_unit_diagonal(self, x):
+        """Return x with every diagonal entry replaced by 1."""
         return jnp.where(np.eye(self.n, dtype=bool), 1.0, x)
 
     def _constraint_residual(self, x):
@@ -214,24 +215,26 @@ class Correlation(PositiveDefinite):
 
     # -- the coordinates, and back ------------------------------------------------------------------------------------
 
-    def _chart(self, x):
+    def _cholesky_coordinates(self, x):
+        """Return the Cholesky factor of x with rows scaled to unit diagonal, below the diagonal, shape (..., dim)."""
         factor = cholesky(x)
         rows = factor / jnp.diagonal(factor, axis1=-2, axis2=-1)[..., None]
         return rows[..., *np.tril_indices(self.n, -1)]
 
-    def _inverse_chart(self, c):
+    def _point_from_cholesky_coordinates(self, c):
+        """Return the correlation matrix with these Cholesky coordinates, shape (..., n, n)."""
         rows = jnp.zeros((*c.shape[:-1], self.n, self.n)).at[..., *np.tril_indices(self.n, -1)].set(c) + np.eye(self.n)
         rows = rows / jnp.sqrt((rows**2).sum(axis=-1, keepdims=True))
         return self._with_unit_diagonal(rows @ rows.swapaxes(-1, -2))
 
     def _coordinates(self, x, v):
         x, v = jnp.broadcast_arrays(x, v)
-        return jax.jvp(self._chart, (x,), (v,))[1]
+        return jax.jvp(self._cholesky_coordinates, (x,), (v,))[1]
 
     def _from_coordinates(self, x, c):
-        start_coordinates = self._chart(x)
+        start_coordinates = self._cholesky_coordinates(x)
         start_coordinates, c = jnp.broadcast_arrays(start_coordinates, c)
-        return jax.jvp(self._inverse_chart, (start_coordinates,), (c,))[1]
+        return jax.jvp(self._point_from_cholesky_coordinates, (start_coordinates,), (c,))[1]
 
     def _frame(self, x):
         return jax.vmap(lambda e: self._from_coordinates(x, e), out_axes=-3)(jnp.eye(self.dim))
@@ -240,21 +243,23 @@ class Correlation(PositiveDefinite):
 
     def _metric_covector(self, x, v):
         c = self._coordinates(x, v)
-        return symmetrize(jax.vjp(self._chart, jnp.broadcast_to(x, (*c.shape[:-1], *self.shape)))[1](c)[0])
+        return symmetrize(
+            jax.vjp(self._cholesky_coordinates, jnp.broadcast_to(x, (*c.shape[:-1], *self.shape)))[1](c)[0]
+        )
 
     def _sharp(self, x, alpha):
         x, alpha = jnp.broadcast_arrays(x, alpha)
-        start_coordinates = self._chart(x)
-        return self._from_coordinates(x, jax.vjp(self._inverse_chart, start_coordinates)[1](alpha)[0])
+        start_coordinates = self._cholesky_coordinates(x)
+        return self._from_coordinates(x, jax.vjp(self._point_from_cholesky_coordinates, start_coordinates)[1](alpha)[0])
 
     def _exp(self, x, v):
-        return self._inverse_chart(self._chart(x) + self._coordinates(x, v))
+        return self._point_from_cholesky_coordinates(self._cholesky_coordinates(x) + self._coordinates(x, v))
 
     def _log(self, x, y):
-        return self._from_coordinates(x, self._chart(y) - self._chart(x))
+        return self._from_coordinates(x, self._cholesky_coordinates(y) - self._cholesky_coordinates(x))
 
     def _squared_distance(self, x, y):
-        return ((self._chart(y) - self._chart(x)) ** 2).sum(axis=-1)
+        return ((self._cholesky_coordinates(y) - self._cholesky_coordinates(x)) ** 2).sum(axis=-1)
 
     def _transport(self, x, v, u):
         return self._from_coordinates(self._exp(x, v), self._coordinates(x, u))

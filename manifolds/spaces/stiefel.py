@@ -164,10 +164,12 @@ class Stiefel(Space):
         return outer - _transpose_matrix(outer) - x @ (_transpose_matrix(x) @ outer)
 
     def _single_log(self, x, y):
+        """Return the logarithm for one pair of points, by Newton's method in coordinates; NaN if it finds none."""
+
         def residual(c):
             return self._exp(x, self._from_coordinates(x, c)) - y
 
-        def newton_step(state):
+        def damped_newton_step(state):
             c, _, steps = state
             J, f = jax.jacfwd(lambda c: (residual(c),) * 2, has_aux=True)(c)
             J, f = J.reshape(-1, self.dim), f.ravel()
@@ -179,7 +181,7 @@ class Stiefel(Space):
 
         def newton_solve(_, start):
             is_unfinished = lambda state: (state[1] > 1e-8) & (state[2] < _MAX_NEWTON_STEPS)  # noqa: E731
-            c, change, _ = jax.lax.while_loop(is_unfinished, newton_step, (start, jnp.inf, 0))
+            c, change, _ = jax.lax.while_loop(is_unfinished, damped_newton_step, (start, jnp.inf, 0))
             is_inside = (c**2).sum() < (self.injectivity_radius() * (1.0 - CUT_MARGIN)) ** 2
             is_solution = (change <= 1e-8) & (
                 jnp.abs(residual(c)).max() <= 1e-10

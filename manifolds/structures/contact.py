@@ -363,28 +363,28 @@ class LagrangianContact(SplitContact):
         return jnp.dot(self._split_coordinates(x)[1], self.momentum(x)) - self.lagrangian(x)
 
     def form(self, x) -> jax.Array:
-        return self._canonical.form(self.legendre(x))
+        return self._canonical_structure.form(self.legendre(x))
 
     def reeb(self, x) -> jax.Array:
-        return self._pullback(x, lambda y, _: self._canonical.reeb(y), jnp.zeros(self.dim))
+        return self._pullback(x, lambda y, _: self._canonical_structure.reeb(y), jnp.zeros(self.dim))
 
     def liouville(self, x) -> jax.Array:
-        return self._pullback(x, lambda y, _: self._canonical.liouville(y), jnp.zeros(self.dim))
+        return self._pullback(x, lambda y, _: self._canonical_structure.liouville(y), jnp.zeros(self.dim))
 
     def sharp(self, x, alpha) -> jax.Array:
-        return self._pullback(x, self._canonical.sharp, alpha)
+        return self._pullback(x, self._canonical_structure.sharp, alpha)
 
     def bivector_sharp(self, x, alpha) -> jax.Array:
-        return self._pullback(x, self._canonical.bivector_sharp, alpha)
+        return self._pullback(x, self._canonical_structure.bivector_sharp, alpha)
 
     def cosymplectic_sharp(self, x, alpha) -> jax.Array:
-        return self._pullback(x, self._canonical.cosymplectic_sharp, alpha)
+        return self._pullback(x, self._canonical_structure.cosymplectic_sharp, alpha)
 
     def liouville_sharp(self, x, alpha) -> jax.Array:
-        return self._pullback(x, self._canonical.liouville_sharp, alpha)
+        return self._pullback(x, self._canonical_structure.liouville_sharp, alpha)
 
     @property
-    def _canonical(self) -> CanonicalContact:
+    def _canonical_structure(self) -> CanonicalContact:
         return CanonicalContact(self.degrees_of_freedom, bundle=self.bundle)
 
     def _pullback(self, x, sharp: Callable, alpha) -> jax.Array:

@@ -120,6 +120,7 @@ class PoissonStructure(Module):
         return int(np.linalg.matrix_rank(np.asarray(self.tensor(real_components(x, self._dimension_at(x), "x")))))
 
     def _dimension_at(self, x) -> int:
+        """Return the dimension of the states; that of x if the structure has states of any dimension."""
         return jnp.shape(x)[-1] if self.dim is None else self.dim
 
 
@@ -456,6 +457,7 @@ class ExtendedPhaseSpace(PoissonStructure):
 def _build_indices(
     degrees_of_freedom: tuple[int, ...], species: tuple[int, ...]
 ) -> tuple[StateIndices, ParticleIndices]:
+    """Return the indices of q, p and S, and of the particle numbers, in a state of several bodies."""
     n, m = np.array(degrees_of_freedom), np.array(species or (0,) * len(degrees_of_freedom))
     starts = np.cumsum(2 * n + 1 + m) - (2 * n + 1 + m)
     owner, holder = np.repeat(np.arange(len(n)), n), np.repeat(np.arange(len(n)), m)

@@ -334,15 +334,14 @@ def check_space(M: Space, length: float = 0.5, seed: int = 0, allowed: float = 1
 
 
 def _constraint_changes(M: Space, x, w) -> list[np.ndarray]:
-    """Return the changes of the constraints along w, along the correction for these changes, and along w made
-    tangent."""
+    """Return the changes of the constraints along w, along the correction by these changes, and along tangential w."""
 
     @jax.jit
-    def changes(x, w):
+    def changes_along_three_vectors(x, w):
         change_along = lambda v: jax.jvp(M._constraints, (x,), (v + jnp.zeros_like(x),))[1]  # noqa: E731
         return change_along(w), change_along(M._correction(x, change_along(w))), change_along(M._tangential_part(x, w))
 
-    return [np.asarray(c) for c in changes(x, np.asarray(w, dtype=M.dtype))]
+    return [np.asarray(c) for c in changes_along_three_vectors(x, np.asarray(w, dtype=M.dtype))]
 
 
 def divergence_by_volume(M: Space, field, x, step: float = 2e-3) -> float:
@@ -350,7 +349,7 @@ def divergence_by_volume(M: Space, field, x, step: float = 2e-3) -> float:
     coordinates = coordinates_around(ProjectionRetraction(M), x)
 
     @jax.jit
-    def flux(c):
+    def volume_and_weighted_components(c):
         place = coordinates.at(c)
         frame = M._frame(place.point)
         volume = 1.0 / jnp.abs(jnp.linalg.det(jax.vmap(place.lower)(frame)))
@@ -358,6 +357,8 @@ def divergence_by_volume(M: Space, field, x, step: float = 2e-3) -> float:
 
     total, axes = 0.0, step * np.eye(M.dim)
     for i, e in enumerate(axes):
-        near_flux, far_flux = (flux(k * e)[1][i] - flux(-k * e)[1][i] for k in (1, 2))
+        near_flux, far_flux = (
+            volume_and_weighted_components(k * e)[1][i] - volume_and_weighted_components(-k * e)[1][i] for k in (1, 2)
+        )
         total += float((8.0 * near_flux - far_flux) / (12.0 * step))
-    return total / float(flux(np.zeros(M.dim))[0])
+    return total / float(volume_and_weighted_components(np.zeros(M.dim))[0])

@@ -245,7 +245,7 @@ class _KernelWriter:
 
     def _output_entry_pointer(self, result_index: int, i: ir.Value) -> ir.Value:
         """Return the pointer to entry i of a result."""
-        start = sum(self.call.entry_counts(self.call.result_specs)[:result_index])
+        start = sum(self.call.real_entry_counts(self.call.result_specs)[:result_index])
         return self._lane_entry_pointer(self.output_pointer, self.builder.add(i, ir.Constant(INT64, start)))
 
     def _matrix_entry_pointer(self, a: ir.Value, i: ir.Value, j: ir.Value, rows: int) -> ir.Value:
@@ -284,7 +284,7 @@ class _KernelWriter:
             self.builder.store(self.builder.load(self.builder.gep(w, [i])), self._output_entry_pointer(result_index, i))
 
     def _write_nan(self) -> None:
-        for i in self._write_loop(len(self.call.kinds)):
+        for i in self._write_loop(len(self.call.result_kinds)):
             self.builder.store(ir.Constant(FLOAT64, math.nan), self._lane_entry_pointer(self.output_pointer, i))
 
     # -- what LAPACK is told ------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from llvmlite import ir
 
-from ...tracing.branches import Branch, instructions_in_branches
+from ...tracing.branches import Branch, sink_instructions_into_branches
 from ...tracing.builder import Block, Instruction, Scalar
 from ...tracing.program import Program
 from ...tracing.scalarize import UnsupportedPrimitive
@@ -97,7 +97,7 @@ class ProgramWriter:
     ) -> list[list[ir.Value]]:
         """Write a program and return its outputs, array by array, with integers and truth values unconverted."""
         emitter = _ProgramEmitter(self, program, read_input, find_table)
-        emitter.write_instructions_and_branches(instructions_in_branches(program))
+        emitter.write_instructions_and_branches(sink_instructions_into_branches(program))
         return [[emitter.value_of_operand(a) for a in entries] for entries in program.outputs]
 
     def cast(self, value: ir.Value, kind: str) -> ir.Value:

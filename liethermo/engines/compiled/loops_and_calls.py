@@ -31,7 +31,7 @@ def write_block(writer: Any, block: Block, args: Sequence[Any]) -> BlockResults:
     if isinstance(block, ScanLoop):
         return _write_scan(writer, block, args)
     if isinstance(block, DeferredBlock):
-        return BlockResults(writer.call_newton(args, len(block.kinds)))
+        return BlockResults(writer.call_newton(args, len(block.result_kinds)))
     if isinstance(block, Routine):
         return _call_routine(writer, block, args)
     if isinstance(block, MatrixProduct):
@@ -80,9 +80,9 @@ def _write_while(writer: Any, loop: WhileLoop, args: Sequence[ir.Value]) -> Bloc
     discarded. They do wait if an inner loop might not end for them.
     """
     build, n_constants = writer.builder, len(loop.test.inputs[0])
-    constants, slots = args[:n_constants], _store_in_new_slots(writer, loop.kinds, args[n_constants:])
+    constants, slots = args[:n_constants], _store_in_new_slots(writer, loop.result_kinds, args[n_constants:])
     has_separate_slots = writer.lanes > 1 and not any(isinstance(i.op, Block) for i in loop.body.instructions)
-    result_slots = _store_in_new_slots(writer, loop.kinds, args[n_constants:]) if has_separate_slots else slots
+    result_slots = _store_in_new_slots(writer, loop.result_kinds, args[n_constants:]) if has_separate_slots else slots
     outer_lanes = writer.active_lanes
     (running_lanes,) = _store_in_new_slots(writer, "b", [writer.constant(True) if outer_lanes is None else outer_lanes])
 
@@ -96,7 +96,7 @@ def _write_while(writer: Any, loop: WhileLoop, args: Sequence[ir.Value]) -> Bloc
         previous_values = [build.load(slot) for slot in slots]
         writer.active_lanes = build.load(running_lanes)
         (new_values,) = writer.write_program(loop.body, _make_argument_reader(constants, previous_values))
-        for slot, result_slot, kind, new_value in zip(slots, result_slots, loop.kinds, new_values, strict=True):
+        for slot, result_slot, kind, new_value in zip(slots, result_slots, loop.result_kinds, new_values, strict=True):
             value = writer.cast(new_value, kind)
             if writer.lanes > 1:
                 build.store(build.select(writer.active_lanes, value, build.load(result_slot)), result_slot)
@@ -233,7 +233,7 @@ def make_table(writer: Any, values: Sequence[ir.Value]) -> Table:
 
 def _call_routine(writer: Any, routine: Routine, args: Sequence[Any]) -> BlockResults:
     """Call a routine as a shared function: numbers are passed in memory, and tables by pointer."""
-    build, n_results = writer.builder, len(routine.kinds)
+    build, n_results = writer.builder, len(routine.result_kinds)
     tables = {i: a for i, a in enumerate(args) if isinstance(a, Table)}
     numbers = [writer.cast(a, "f") for i, a in enumerate(args) if i not in tables]
     inputs = Table(writer, writer.double_type, numbers, length=1)
@@ -327,7 +327,7 @@ def _write_matrix_product_function(
 
 def _call_kernel(writer: Any, call: LapackCall, args: Sequence[ir.Value]) -> BlockResults:
     """Call a LAPACK kernel lane by lane, so that the result in one lane does not depend on the others."""
-    build, n_results = writer.builder, len(call.kinds)
+    build, n_results = writer.builder, len(call.result_kinds)
     inputs = Table(writer, writer.double_type, [writer.cast(a, "f") for a in args])
     results = Table(writer, writer.double_type, length=n_results)
     pointers = [build.bitcast(table.start, ir.DoubleType().as_pointer()) for table in (inputs, results)]

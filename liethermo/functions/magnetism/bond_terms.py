@@ -24,7 +24,7 @@ from ..conditions import checked_numbers
 from ..energy import Energy, Sum
 from ..indices import clique_pattern
 from .lattices import Bonds, Lattice
-from .spin_energy import SpinEnergy, bond_indices, check_finite
+from .spin_energy import SpinEnergy, bond_component_indices, check_finite
 
 
 def exchange_tensor(bonds, tensors) -> Energy:
@@ -55,7 +55,7 @@ def exchange_tensor(bonds, tensors) -> Energy:
     >>> float(ising(np.tile([0.0, 0.0, 1.0], 8)))
     -8.0
     """
-    return _bond_matrix_energy(_as_bonds(bonds), tensors, -1.0, "an exchange tensor")
+    return _bond_matrix_energy(_checked_bonds(bonds), tensors, -1.0, "an exchange tensor")
 
 
 def biquadratic(bonds, strength=1.0) -> Energy:
@@ -76,48 +76,49 @@ def biquadratic(bonds, strength=1.0) -> Energy:
     ------
     InputError
     """
-    bonds = _as_bonds(bonds)
+    bonds = _checked_bonds(bonds)
     values = _bond_values(bonds, strength, (), "a biquadratic constant")
     lattice = bonds.lattice
-    return BiquadraticEnergy(lattice.sites, lattice.cells, _bond_rows(bonds), tuple(values))
+    return BiquadraticEnergy(lattice.sites, lattice.cells, _atoms_and_offset_rows(bonds), tuple(values))
 
 
-def crystal_exchange(target: Lattice | Bonds, strength) -> Energy:
+def crystal_exchange(lattice_or_bonds: Lattice | Bonds, strength) -> Energy:
     """Return the Heisenberg exchange of bonds, or of shells of a lattice; see ``magnetism.exchange``."""
-    if isinstance(target, Bonds):
-        return _scalar_exchange(target, strength)
+    if isinstance(lattice_or_bonds, Bonds):
+        return _scalar_exchange(lattice_or_bonds, strength)
     if isinstance(strength, Mapping):
         if not strength:
             raise InputError("a mapping from shells to exchange constants must not be empty")
-        return Sum.of([_scalar_exchange(target.shell(number), J) for number, J in strength.items()])
+        return Sum.from_terms([_scalar_exchange(lattice_or_bonds.shell(number), J) for number, J in strength.items()])
     if isinstance(strength, list | tuple):
         if not strength:
             raise InputError("a list of exchange constants, one for each shell, must not be empty")
-        shells = target.shells(len(strength))
-        return Sum.of([_scalar_exchange(shell, J) for shell, J in zip(shells, strength, strict=True)])
-    return _scalar_exchange(target.shell(1), strength)
+        shells = lattice_or_bonds.shells(len(strength))
+        return Sum.from_terms([_scalar_exchange(shell, J) for shell, J in zip(shells, strength, strict=True)])
+    return _scalar_exchange(lattice_or_bonds.shell(1), strength)
 
 
 def _scalar_exchange(bonds: Bonds, strength) -> Energy:
+    """Return the Heisenberg exchange of bonds, with one constant or one for each bond."""
     bonds.check_pairs()
     value = check_finite(checked_numbers(strength, "an exchange constant"), "an exchange constant")
     cells = bonds.lattice.cells
     if not value.ndim and all(bonds.presence(k).all() for k in range(len(bonds))):
-        return CrystalExchange(bonds.lattice.sites, cells, _bond_rows(bonds), value)
+        return CrystalExchange(bonds.lattice.sites, cells, _atoms_and_offset_rows(bonds), value)
     J = _bond_values(bonds, strength, (), "an exchange constant")
-    return CrystalExchange(bonds.lattice.sites, cells, _bond_rows(bonds), tuple(J))
+    return CrystalExchange(bonds.lattice.sites, cells, _atoms_and_offset_rows(bonds), tuple(J))
 
 
-def crystal_antisymmetric_exchange(target: Lattice | Bonds, vectors) -> Energy:
+def crystal_antisymmetric_exchange(lattice_or_bonds: Lattice | Bonds, vectors) -> Energy:
     """Return the Dzyaloshinskii-Moriya interaction of bonds; see ``magnetism.dzyaloshinskii_moriya``."""
-    what = "a Dzyaloshinskii-Moriya vector"
-    bonds, D = _as_bonds(target), checked_numbers(vectors, what)
+    vector_name = "a Dzyaloshinskii-Moriya vector"
+    bonds, D = _checked_bonds(lattice_or_bonds), checked_numbers(vectors, vector_name)
     if D.shape[-1:] != (3,):
-        raise InputError(f"{what} must have shape (3,), (m, 3) or (m, *cells, 3), got {D.shape}")
+        raise InputError(f"{vector_name} must have shape (3,), (m, 3) or (m, *cells, 3), got {D.shape}")
     # D . (u x v) = u . A v
     zero = jnp.zeros_like(D[..., 0])
     rows = [[zero, D[..., 2], -D[..., 1]], [-D[..., 2], zero, D[..., 0]], [D[..., 1], -D[..., 0], zero]]
-    return _bond_matrix_energy(bonds, jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2), 1.0, what)
+    return _bond_matrix_energy(bonds, jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2), 1.0, vector_name)
 
 
 def refuse_grid_arguments(neighbours, periodic, images: bool) -> None:
@@ -129,44 +130,57 @@ def refuse_grid_arguments(neighbours, periodic, images: bool) -> None:
         )
 
 
-def _as_bonds(target) -> Bonds:
-    if not isinstance(target, Lattice | Bonds):
-        raise InputError(f"bonds must be those of lt.magnetism.lattice, or a lattice, got {type(target).__name__}")
-    bonds = target.shell(1) if isinstance(target, Lattice) else target
+def _checked_bonds(lattice_or_bonds) -> Bonds:
+    """Return bonds, or those of nearest neighbours of a lattice; InputError for other objects and for double bonds."""
+    if not isinstance(lattice_or_bonds, Lattice | Bonds):
+        raise InputError(
+            f"bonds must be those of lt.magnetism.lattice, or a lattice, got {type(lattice_or_bonds).__name__}"
+        )
+    bonds = lattice_or_bonds.shell(1) if isinstance(lattice_or_bonds, Lattice) else lattice_or_bonds
     bonds.check_pairs()
     return bonds
 
 
-def _bond_rows(bonds: Bonds) -> tuple[tuple[int, ...], ...]:
+def _atoms_and_offset_rows(bonds: Bonds) -> tuple[tuple[int, ...], ...]:
+    """Return a tuple (first atom, second atom, *offset) of integers for each bond."""
     rows = np.column_stack([bonds.first, bonds.second, bonds.offsets]).tolist()
     return tuple(map(tuple, rows))
 
 
-def _bond_values(bonds: Bonds, value, tail: tuple[int, ...], what: str) -> list[jax.Array]:
-    """Return the values of each bond: of shape ``tail``, or ``(*cells, *tail)`` where they vary, 0 without a bond."""
-    array = check_finite(checked_numbers(value, what), what)
+def _bond_values(bonds: Bonds, values, value_shape: tuple[int, ...], quantity_name: str) -> list[jax.Array]:
+    """Return a list with the values of each bond, checked.
+
+    They have shape ``value_shape``, or ``(*cells, *value_shape)`` where they vary between cells; they are 0 in cells
+    without the bond.
+    """
+    array = check_finite(checked_numbers(values, quantity_name), quantity_name)
     count, cells = len(bonds), bonds.lattice.cells
-    shapes = tail, (count, *tail), (count, *cells, *tail)
+    shapes = value_shape, (count, *value_shape), (count, *cells, *value_shape)
     if array.shape not in shapes:
-        raise InputError(f"{what} of {count} bonds must have shape {' or '.join(map(str, shapes))}, got {array.shape}")
-    values = []
+        raise InputError(
+            f"{quantity_name} of {count} bonds must have shape {' or '.join(map(str, shapes))}, got {array.shape}"
+        )
+    bond_values = []
     for number in range(count):
-        bond_value = array if array.shape == tail else array[number]
+        bond_value = array if array.shape == value_shape else array[number]
         presence = bonds.presence(number)
         if not presence.all():
-            bond_value = jnp.where(presence.reshape(*cells, *(1 for _ in tail)), bond_value, 0.0)
-        values.append(bond_value)
-    return values
+            bond_value = jnp.where(presence.reshape(*cells, *(1 for _ in value_shape)), bond_value, 0.0)
+        bond_values.append(bond_value)
+    return bond_values
 
 
-def _bond_matrix_energy(bonds: Bonds, matrices, sign: float, what: str) -> Energy:
-    values = _bond_values(bonds, matrices, (3, 3), what)
+def _bond_matrix_energy(bonds: Bonds, matrices, sign: float, quantity_name: str) -> Energy:
+    """Return the energy ``sign sum s_i . M_ij s_j`` over bonds, with checked matrices."""
+    values = _bond_values(bonds, matrices, (3, 3), quantity_name)
     lattice = bonds.lattice
-    return BondMatrixEnergy(lattice.sites, lattice.cells, _bond_rows(bonds), tuple(sign * value for value in values))
+    return BondMatrixEnergy(
+        lattice.sites, lattice.cells, _atoms_and_offset_rows(bonds), tuple(sign * value for value in values)
+    )
 
 
 class CrystalBondEnergy(SpinEnergy):
-    """An energy of the bonds of a crystal.
+    """Base class of energies of the bonds of a crystal.
 
     Attributes
     ----------
@@ -187,34 +201,42 @@ class CrystalBondEnergy(SpinEnergy):
     def _has_basis(self) -> bool:
         return len(self.sites) > len(self.cells)
 
-    def _atom(self, spins: VectorComponents, atom: int) -> VectorComponents:
-        """Return the spins of one atom of the cells, shape of the cells."""
+    def _spins_of_atom(self, spins: VectorComponents, atom: int) -> VectorComponents:
+        """Return the spins of one atom of the basis in all cells, shape of the cells."""
         if not self._has_basis:
             return spins
         a, b, c = (component[..., atom] for component in spins)
         return a, b, c
 
-    def _shifted_atom(self, shifted: dict, spins: PeriodicSpins, atom: int, offset) -> VectorComponents:
-        """Return for each cell the spin of an atom of the cell at an offset; ``shifted`` caches shifted lattices."""
+    def _spins_of_atom_in_shifted_cells(
+        self, shifted_cache: dict, spins: PeriodicSpins, atom: int, offset
+    ) -> VectorComponents:
+        """Return the spins of one atom in the cells at an offset from each cell, shape of the cells.
+
+        ``shifted_cache`` caches shifted lattices by their offset.
+        """
         offset = tuple(offset)
-        if offset not in shifted:
-            shifted[offset] = (
+        if offset not in shifted_cache:
+            shifted_cache[offset] = (
                 spins.at((*offset, *(0,) * (len(self.sites) - len(self.cells)))) if any(offset) else (spins.site_spins)
             )
-        return self._atom(shifted[offset], atom)
+        return self._spins_of_atom(shifted_cache[offset], atom)
 
-    def _join_atoms(self, gradients: dict[int, VectorComponents]) -> VectorComponents:
-        """Return vectors on the sites from those of each atom, shape of the cells."""
+    def _join_vectors_of_atoms(self, vectors_by_atom: dict[int, VectorComponents]) -> VectorComponents:
+        """Return vectors on the shape of the sites from the vectors of each atom of the basis; zero for other atoms."""
         if not self._has_basis:
-            return gradients[0]
+            return vectors_by_atom[0]
         zero = jnp.zeros(self.cells)
-        atoms = [gradients.get(atom, (zero, zero, zero)) for atom in range(self.sites[-1])]
+        atoms = [vectors_by_atom.get(atom, (zero, zero, zero)) for atom in range(self.sites[-1])]
         a, b, c = (jnp.stack([vectors[axis] for vectors in atoms], axis=-1) for axis in range(3))
         return a, b, c
 
-    def _roll(self, value, offset, tail: int = 0):
-        """Return values of cells, moved to the cell of the second end of a bond."""
-        return value if value.ndim == tail else jnp.roll(value, offset, axis=tuple(range(len(self.cells))))
+    def _shift_cells(self, value, offset, n_trailing_axes: int = 0):
+        """Return values on the cells shifted by an offset; values that are equal in all cells are returned unchanged.
+
+        The last ``n_trailing_axes`` axes hold the value of one cell.
+        """
+        return value if value.ndim == n_trailing_axes else jnp.roll(value, offset, axis=tuple(range(len(self.cells))))
 
     def couplings(self, dim: int) -> scipy.sparse.csr_array:
         atoms = self.sites[-1] if self._has_basis else 1
@@ -222,7 +244,7 @@ class CrystalBondEnergy(SpinEnergy):
         members = []
         for a, b, *offset in self.rows:
             ends = np.roll(numbers, [-o for o in offset], axis=tuple(range(len(self.cells))))
-            members.append(bond_indices(numbers.ravel() * atoms + a, ends.ravel() * atoms + b))
+            members.append(bond_component_indices(numbers.ravel() * atoms + a, ends.ravel() * atoms + b))
         return clique_pattern(np.concatenate(members), dim)
 
 
@@ -238,28 +260,32 @@ class CrystalExchange(CrystalBondEnergy):
     J: jax.Array | tuple[jax.Array, ...]
 
     def lattice_value(self, spins: PeriodicSpins) -> jax.Array:
-        shifted: dict = {}
+        shifted_cache: dict = {}
         total: dict[int, VectorComponents] = {}
         for number, (a, b, *offset) in enumerate(self.rows):
-            neighbour = self._shifted_atom(shifted, spins, b, offset)
-            _accumulate(total, a, scale_vectors(self.J[number], neighbour) if isinstance(self.J, tuple) else neighbour)
+            neighbour = self._spins_of_atom_in_shifted_cells(shifted_cache, spins, b, offset)
+            _add_to_atom(total, a, scale_vectors(self.J[number], neighbour) if isinstance(self.J, tuple) else neighbour)
         energy = sum(
-            (sum_of_dots(self._atom(spins.site_spins, a), vectors) for a, vectors in total.items()), jnp.zeros(())
+            (sum_of_dots(self._spins_of_atom(spins.site_spins, a), vectors) for a, vectors in total.items()),
+            jnp.zeros(()),
         )
         return -energy if isinstance(self.J, tuple) else -self.J * energy
 
     def lattice_gradients(self, spins: PeriodicSpins) -> VectorComponents:
-        shifted: dict = {}
+        shifted_cache: dict = {}
         total: dict[int, VectorComponents] = {}
         for number, (a, b, *offset) in enumerate(self.rows):
-            ahead = self._shifted_atom(shifted, spins, b, offset)
-            behind = self._shifted_atom(shifted, spins, a, [-o for o in offset])
+            spin_ahead = self._spins_of_atom_in_shifted_cells(shifted_cache, spins, b, offset)
+            spin_behind = self._spins_of_atom_in_shifted_cells(shifted_cache, spins, a, [-o for o in offset])
             if isinstance(self.J, tuple):
                 J = self.J[number]
-                ahead, behind = scale_vectors(J, ahead), scale_vectors(self._roll(J, offset), behind)
-            _accumulate(total, a, ahead)
-            _accumulate(total, b, behind)
-        return scale_vectors(-1.0 if isinstance(self.J, tuple) else -self.J, self._join_atoms(total))
+                spin_ahead, spin_behind = (
+                    scale_vectors(J, spin_ahead),
+                    scale_vectors(self._shift_cells(J, offset), spin_behind),
+                )
+            _add_to_atom(total, a, spin_ahead)
+            _add_to_atom(total, b, spin_behind)
+        return scale_vectors(-1.0 if isinstance(self.J, tuple) else -self.J, self._join_vectors_of_atoms(total))
 
     def multiple(self, factor) -> Energy:
         J = tuple(factor * value for value in self.J) if isinstance(self.J, tuple) else factor * self.J
@@ -278,22 +304,24 @@ class BondMatrixEnergy(CrystalBondEnergy):
     matrices: tuple[jax.Array, ...]
 
     def lattice_value(self, spins: PeriodicSpins) -> jax.Array:
-        shifted: dict = {}
+        shifted_cache: dict = {}
         energy = jnp.zeros(())
         for M, (a, b, *offset) in zip(self.matrices, self.rows, strict=True):
-            neighbour = _matrix_times(M, self._shifted_atom(shifted, spins, b, offset))
-            energy = energy + sum_of_dots(self._atom(spins.site_spins, a), neighbour)
+            neighbour = _matrix_times(M, self._spins_of_atom_in_shifted_cells(shifted_cache, spins, b, offset))
+            energy = energy + sum_of_dots(self._spins_of_atom(spins.site_spins, a), neighbour)
         return energy
 
     def lattice_gradients(self, spins: PeriodicSpins) -> VectorComponents:
-        shifted: dict = {}
+        shifted_cache: dict = {}
         total: dict[int, VectorComponents] = {}
         for M, (a, b, *offset) in zip(self.matrices, self.rows, strict=True):
-            transpose = jnp.swapaxes(self._roll(M, offset, 2), -1, -2)
-            _accumulate(total, a, _matrix_times(M, self._shifted_atom(shifted, spins, b, offset)))
-            behind = self._shifted_atom(shifted, spins, a, [-o for o in offset])
-            _accumulate(total, b, _matrix_times(transpose, behind))
-        return self._join_atoms(total)
+            transpose = jnp.swapaxes(self._shift_cells(M, offset, 2), -1, -2)
+            _add_to_atom(
+                total, a, _matrix_times(M, self._spins_of_atom_in_shifted_cells(shifted_cache, spins, b, offset))
+            )
+            spin_behind = self._spins_of_atom_in_shifted_cells(shifted_cache, spins, a, [-o for o in offset])
+            _add_to_atom(total, b, _matrix_times(transpose, spin_behind))
+        return self._join_vectors_of_atoms(total)
 
     def multiple(self, factor) -> Energy:
         return BondMatrixEnergy(self.sites, self.cells, self.rows, tuple(factor * M for M in self.matrices))
@@ -318,31 +346,35 @@ class BiquadraticEnergy(CrystalBondEnergy):
         return 4.0
 
     def lattice_value(self, spins: PeriodicSpins) -> jax.Array:
-        shifted: dict = {}
+        shifted_cache: dict = {}
         energy = jnp.zeros(())
         for B, (a, b, *offset) in zip(self.B, self.rows, strict=True):
-            cosine = dot_vectors(self._atom(spins.site_spins, a), self._shifted_atom(shifted, spins, b, offset))
+            cosine = dot_vectors(
+                self._spins_of_atom(spins.site_spins, a),
+                self._spins_of_atom_in_shifted_cells(shifted_cache, spins, b, offset),
+            )
             energy = energy - jnp.sum(B * cosine**2)
         return energy
 
     def lattice_gradients(self, spins: PeriodicSpins) -> VectorComponents:
-        shifted: dict = {}
+        shifted_cache: dict = {}
         total: dict[int, VectorComponents] = {}
         for B, (a, b, *offset) in zip(self.B, self.rows, strict=True):
-            first, second = self._atom(spins.site_spins, a), self._atom(spins.site_spins, b)
-            ahead = self._shifted_atom(shifted, spins, b, offset)
-            behind = self._shifted_atom(shifted, spins, a, [-o for o in offset])
-            _accumulate(total, a, scale_vectors(-2.0 * B * dot_vectors(first, ahead), ahead))
-            B_behind = self._roll(B, offset)
-            _accumulate(total, b, scale_vectors(-2.0 * B_behind * dot_vectors(second, behind), behind))
-        return self._join_atoms(total)
+            first_spin, second_spin = self._spins_of_atom(spins.site_spins, a), self._spins_of_atom(spins.site_spins, b)
+            spin_ahead = self._spins_of_atom_in_shifted_cells(shifted_cache, spins, b, offset)
+            spin_behind = self._spins_of_atom_in_shifted_cells(shifted_cache, spins, a, [-o for o in offset])
+            _add_to_atom(total, a, scale_vectors(-2.0 * B * dot_vectors(first_spin, spin_ahead), spin_ahead))
+            B_behind = self._shift_cells(B, offset)
+            _add_to_atom(total, b, scale_vectors(-2.0 * B_behind * dot_vectors(second_spin, spin_behind), spin_behind))
+        return self._join_vectors_of_atoms(total)
 
     def multiple(self, factor) -> Energy:
         return BiquadraticEnergy(self.sites, self.cells, self.rows, tuple(factor * B for B in self.B))
 
 
-def _accumulate(total: dict[int, VectorComponents], atom: int, vectors: VectorComponents) -> None:
-    total[atom] = add_vectors(total[atom], vectors) if atom in total else vectors
+def _add_to_atom(totals_by_atom: dict[int, VectorComponents], atom: int, vectors: VectorComponents) -> None:
+    """Add vectors to the total of an atom, in place."""
+    totals_by_atom[atom] = add_vectors(totals_by_atom[atom], vectors) if atom in totals_by_atom else vectors
 
 
 def _matrix_times(M, v: VectorComponents) -> VectorComponents:

@@ -39,8 +39,8 @@ class StructureFactor(NamedTuple):
         """Sum over the components across the wave vector, which neutrons see, ``sum (1 - q q / q^2)_ab S_ab``."""
         length = np.linalg.norm(self.wave_vectors, axis=-1, keepdims=True)
         e = np.where(length > 0.0, self.wave_vectors / np.where(length > 0.0, length, 1.0), 0.0)
-        along = np.einsum("...a,...ab,...b->...", e, self.values, e)
-        return np.real(np.trace(self.values, axis1=-2, axis2=-1) - along)
+        longitudinal = np.einsum("...a,...ab,...b->...", e, self.values, e)
+        return np.real(np.trace(self.values, axis1=-2, axis2=-1) - longitudinal)
 
 
 def structure_factor(spins, lattice: Lattice, wave_vectors=None) -> StructureFactor:
@@ -72,7 +72,7 @@ def structure_factor(spins, lattice: Lattice, wave_vectors=None) -> StructureFac
     [4.0, 0.0, 0.0, 0.0]
     """
     samples = _checked_samples(spins, lattice)
-    q, modes = _modes(samples, lattice, wave_vectors)
+    q, modes = _wave_vectors_and_fourier_modes(samples, lattice, wave_vectors)
     values = np.mean(modes[..., :, None] * np.conj(modes[..., None, :]), axis=0) / lattice.site_count
     return StructureFactor(q, values)
 
@@ -121,12 +121,12 @@ def dynamic_structure_factor(
     length = 2 * len(t) // (segments + 1)
     weights = np.ones(length) if window == "none" else 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)
     weights = weights / math.sqrt(np.mean(weights**2))
-    q, modes = _modes(samples, lattice, wave_vectors)
+    q, modes = _wave_vectors_and_fourier_modes(samples, lattice, wave_vectors)
     starts = np.linspace(0, len(t) - length, segments).round().astype(int)
     total = 0.0
     for start in starts:
-        piece = modes[start : start + length] * weights.reshape(-1, *(1,) * (modes.ndim - 1))
-        spectrum = step * length * np.fft.fftshift(np.fft.ifft(piece, axis=0), axes=0)
+        windowed_segment = modes[start : start + length] * weights.reshape(-1, *(1,) * (modes.ndim - 1))
+        spectrum = step * length * np.fft.fftshift(np.fft.ifft(windowed_segment, axis=0), axes=0)
         total = total + spectrum[..., :, None] * np.conj(spectrum[..., None, :])
     frequencies = 2.0 * np.pi * np.fft.fftshift(np.fft.fftfreq(length, step))
     scale = 2.0 * np.pi * lattice.site_count * length * step * segments
@@ -148,15 +148,20 @@ def _checked_samples(spins, lattice: Lattice) -> np.ndarray:
     return s.reshape(-1, *lattice.cells, len(lattice.basis), 3)
 
 
-def _modes(samples: np.ndarray, lattice: Lattice, wave_vectors) -> tuple[np.ndarray, np.ndarray]:
-    """Return wave vectors, shape (..., 3), and ``sum s_i exp(-i q . r_i)``, shape (samples, ..., 3)."""
+def _wave_vectors_and_fourier_modes(
+    samples: np.ndarray, lattice: Lattice, wave_vectors
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return wave vectors q, shape (..., 3), and the modes ``sum s_i exp(-i q . r_i)``, shape (samples, ..., 3).
+
+    The wave vectors are those of the periodic lattice if ``wave_vectors`` is None.
+    """
     axes = tuple(range(1, 1 + len(lattice.cells)))
     if wave_vectors is None:
         fractions = np.meshgrid(*(np.fft.fftfreq(n) for n in lattice.cells), indexing="ij")
         q = np.stack(fractions, axis=-1) @ lattice.reciprocal_vectors
-        by_atom = np.fft.fftn(samples, axes=axes)
+        atom_transforms = np.fft.fftn(samples, axes=axes)
         phases = np.exp(-1j * np.einsum("...c,ac->...a", q, lattice.basis))
-        return q, np.einsum("...ac,...a->...c", by_atom, phases)
+        return q, np.einsum("...ac,...a->...c", atom_transforms, phases)
     q = np.asarray(checked_numbers(wave_vectors, "wave vectors"))
     if q.shape[-1:] != (3,):
         raise InputError(f"wave vectors must have shape (..., 3), got {q.shape}")
@@ -197,12 +202,12 @@ def topological_charge(spins, periodic=False) -> np.ndarray | float:
         if is_periodic:
             m = np.concatenate([m, np.take(m, [0], axis=axis)], axis=axis)
     a, b, c, d = m[..., :-1, :-1, :], m[..., 1:, :-1, :], m[..., 1:, 1:, :], m[..., :-1, 1:, :]
-    areas = _signed_area(a, b, c) + _signed_area(a, c, d)
+    areas = _signed_spherical_triangle_area(a, b, c) + _signed_spherical_triangle_area(a, c, d)
     charge = np.sum(areas, axis=(-1, -2)) / (4.0 * np.pi)
     return float(charge) if charge.ndim == 0 else charge
 
 
-def _signed_area(a, b, c) -> np.ndarray:
+def _signed_spherical_triangle_area(a, b, c) -> np.ndarray:
     """Return the signed areas of spherical triangles, ``2 atan2(a . (b x c), 1 + a . b + b . c + c . a)``."""
     volume = np.sum(a * np.cross(b, c), axis=-1)
     return 2.0 * np.arctan2(volume, 1.0 + np.sum(a * b, axis=-1) + np.sum(b * c, axis=-1) + np.sum(c * a, axis=-1))

@@ -63,8 +63,8 @@ def dipoles(positions, moment=1.0, strength=1.0, boundary: str = "tin foil") -> 
         raise InputError(f'the boundary of dipoles must be "tin foil" or "vacuum", got {boundary!r}')
     if isinstance(positions, Lattice):
         moments = checked_site_values(moment, positions.sites, (), "a moment")
-        kernel = lattice_kernel(positions, boundary)
-        return kernel_energy(positions.sites, len(positions.cells), kernel, moments, strength)
+        kernel = dipolar_lattice_kernel(positions, boundary)
+        return pair_interaction_energy(positions.sites, len(positions.cells), kernel, moments, strength)
     r = np.asarray(check_finite(checked_numbers(positions, "positions of dipoles"), "positions of dipoles"))
     if r.ndim != 2 or r.shape[1] != 3:
         raise InputError(f"positions of dipoles must have shape (N, 3), got {r.shape}")
@@ -82,13 +82,16 @@ MAX_MATRIX_SITES = 16
 """Number of sites up to which a lattice has a matrix of all pairs: the compiled engine has no Fourier transforms."""
 
 
-def kernel_energy(sites: tuple[int, ...], axes: int, kernel: FourierKernel, moments, strength) -> Energy:
-    """Return the energy of the pair interaction with a kernel, by Fourier transforms or, for a few sites, a matrix."""
-    by_transforms = ConvolutionEnergy(sites, axes, kernel, moments, strength)
+def pair_interaction_energy(sites: tuple[int, ...], n_axes: int, kernel: FourierKernel, moments, strength) -> Energy:
+    """Return the quadratic energy of all pairs of sites that interact by a kernel.
+
+    It is computed by Fourier transforms or, for at most :data:`MAX_MATRIX_SITES` sites, by a matrix.
+    """
+    convolution_energy = ConvolutionEnergy(sites, n_axes, kernel, moments, strength)
     count = math.prod(sites)
     if count > MAX_MATRIX_SITES:
-        return by_transforms
-    return DipoleMatrix(sites, jax.vmap(by_transforms.gradient)(jnp.eye(3 * count)))
+        return convolution_energy
+    return DipoleMatrix(sites, jax.vmap(convolution_energy.gradient)(jnp.eye(3 * count)))
 
 
 class DipoleMatrix(SpinEnergy):
@@ -156,9 +159,9 @@ class FourierKernel(Module):
     Attributes
     ----------
     components : tuple of six arrays, shape (atoms, atoms, *transformed cells), real or complex
-        The components xx, xy, xz, yy, yz, zz, in the order of axes of :meth:`_transform`. They are arrays of their own,
-        and real ones are not multiplied with complex modes: XLA would move slices or complex copies of them out of a
-        loop, one for each use, and then compute equal fields for each use.
+        The components xx, xy, xz, yy, yz, zz, in the order of axes of :meth:`_forward_transform`. They are arrays of
+        their own, and real ones are not multiplied with complex modes: XLA would move slices or complex copies of them
+        out of a loop, one for each use, and then compute equal fields for each use.
     cells, padded_cells : tuple of int
     """
 
@@ -173,26 +176,30 @@ class FourierKernel(Module):
         return cls.from_transform(np.fft.rfftn(tensors, axes=axes), cells, tensors.shape[3:])
 
     @classmethod
-    def from_transform(cls, transform: np.ndarray, cells: tuple[int, ...], padded: tuple[int, ...]) -> FourierKernel:
+    def from_transform(
+        cls, transform: np.ndarray, cells: tuple[int, ...], padded_cells: tuple[int, ...]
+    ) -> FourierKernel:
         """Return the kernel of a transform, which is made real if each atom is a centre of inversion."""
         if np.abs(transform.imag).max() <= REAL_TOLERANCE * np.abs(transform).max():
             transform = transform.real
-        transform = np.moveaxis(transform, 3 + transform_axes(padded)[-1], 3)
-        return cls(tuple(jnp.asarray(np.ascontiguousarray(part)) for part in transform), cells, padded)
+        transform = np.moveaxis(transform, 3 + transform_axes(padded_cells)[-1], 3)
+        return cls(tuple(jnp.asarray(np.ascontiguousarray(part)) for part in transform), cells, padded_cells)
 
     def convolve(self, s) -> jax.Array:
         """Return ``sum_j T(r_i - r_j) s_j``, for s of shape (3, atoms, *cells)."""
-        modes = self._transform(s)
+        modes = self._forward_transform(s)
         if jnp.iscomplexobj(self.components[0]):
-            return self._transform_back(self._multiply(modes))
-        return self._transform_back(jax.lax.complex(self._multiply(modes.real), self._multiply(modes.imag)))
+            return self._inverse_transform(self._multiply_modes(modes))
+        return self._inverse_transform(
+            jax.lax.complex(self._multiply_modes(modes.real), self._multiply_modes(modes.imag))
+        )
 
-    def _multiply(self, modes) -> jax.Array:
+    def _multiply_modes(self, modes) -> jax.Array:
         """Return the product of the kernel with modes, both real or both complex, shape (3, atoms, *modes)."""
         products = [[self.components[PAIR_INDEX[i][j]] * modes[j] for j in range(3)] for i in range(3)]
         return jnp.stack([jnp.sum(x + y + z, axis=1) for x, y, z in products])
 
-    def _transform(self, s) -> jax.Array:
+    def _forward_transform(self, s) -> jax.Array:
         """Return the Fourier modes of s, with the last axis, which is transformed first, before the other ones.
 
         So no transform of that axis has to pass over the zeros along the others, nor over strided memory.
@@ -202,7 +209,7 @@ class FourierKernel(Module):
         modes = jnp.moveaxis(modes, 2 + last_axis, 2)
         return jnp.fft.fftn(modes, [self.padded_cells[axis] for axis in other_axes], [3 + axis for axis in other_axes])
 
-    def _transform_back(self, modes) -> jax.Array:
+    def _inverse_transform(self, modes) -> jax.Array:
         *other_axes, last_axis = transform_axes(self.padded_cells)
         rows = jnp.fft.ifftn(modes, axes=[3 + axis for axis in other_axes])
         rows = rows[(..., *(slice(n) for axis, n in enumerate(self.cells) if axis != last_axis))]
@@ -230,38 +237,38 @@ def padded_length(n: int, is_periodic: bool) -> int:
         length += 1
 
 
-def lattice_kernel(lattice: Lattice, boundary: str) -> FourierKernel:
+def dipolar_lattice_kernel(lattice: Lattice, boundary: str) -> FourierKernel:
     """Return the Fourier transform of the dipolar tensors of a lattice, periodic images included."""
-    padded = tuple(padded_length(n, p) for n, p in zip(lattice.cells, lattice.periodic, strict=True))
+    padded_cells = tuple(padded_length(n, p) for n, p in zip(lattice.cells, lattice.periodic, strict=True))
     if any(lattice.periodic):
-        return _periodic_kernel(lattice, padded, boundary)
+        return _ewald_lattice_kernel(lattice, padded_cells, boundary)
     atoms = len(lattice.basis)
-    offsets = _offsets(padded)
+    offsets = _cell_offsets(padded_cells)
     r = offsets @ lattice.vectors
     # No two cells have these offsets. With zeros there, T(-r) = T(r) for all entries, so that the transform is real.
     is_unused = (np.abs(offsets) >= lattice.cells).any(axis=-1)
-    tensors = np.empty((len(COMPONENTS), atoms, atoms, *padded))
+    tensors = np.empty((len(COMPONENTS), atoms, atoms, *padded_cells))
     for a, b in np.ndindex(atoms, atoms):
-        tensors[:, a, b] = _six_components(dipole_tensor(r + lattice.basis[a] - lattice.basis[b]))
+        tensors[:, a, b] = _symmetric_components(dipole_tensor(r + lattice.basis[a] - lattice.basis[b]))
     tensors[..., is_unused] = 0.0
     return FourierKernel.from_tensors(tensors, lattice.cells)
 
 
-def _periodic_kernel(lattice: Lattice, padded: tuple[int, ...], boundary: str) -> FourierKernel:
+def _ewald_lattice_kernel(lattice: Lattice, padded_cells: tuple[int, ...], boundary: str) -> FourierKernel:
     """Return the kernel of a lattice with periodic axes from its sums over images, by Ewald's method."""
-    transform = ewald_kernel(lattice, padded)
+    transform = ewald_kernel(lattice, padded_cells)
     if all(lattice.periodic) and len(lattice.cells) == 3 and boundary == "vacuum":
         for component in (0, 3, 5):  # the field of a sphere is that of the mean moment, at wave vector zero
             transform[component, :, :, 0, 0, 0] += 4.0 * np.pi / (3.0 * lattice.cell_volume)
-    return FourierKernel.from_transform(transform, lattice.cells, padded)
+    return FourierKernel.from_transform(transform, lattice.cells, padded_cells)
 
 
-def _offsets(padded: tuple[int, ...]) -> np.ndarray:
-    """Return the offsets of cells on a padded lattice, shape (*padded, d): 0, 1, …, -1 along each axis."""
-    axes = [np.rint(np.fft.fftfreq(n, 1.0 / n)) for n in padded]
+def _cell_offsets(padded_cells: tuple[int, ...]) -> np.ndarray:
+    """Return the offsets of cells on a padded lattice, shape (*padded_cells, d): 0, 1, …, -1 along each axis."""
+    axes = [np.rint(np.fft.fftfreq(n, 1.0 / n)) for n in padded_cells]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
-def _six_components(tensors: np.ndarray) -> np.ndarray:
-    """Return the components xx, xy, xz, yy, yz, zz of tensors, shape (..., 3, 3), along a new first axis."""
+def _symmetric_components(tensors: np.ndarray) -> np.ndarray:
+    """Return the components xx, xy, xz, yy, yz, zz of symmetric tensors, shape (..., 3, 3), along a new first axis."""
     return np.stack([tensors[..., i, j] for i, j in COMPONENTS])

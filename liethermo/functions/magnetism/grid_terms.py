@@ -39,7 +39,7 @@ from ..indices import clique_pattern
 from ..mechanics import Each
 from .bond_terms import crystal_antisymmetric_exchange, crystal_exchange, refuse_grid_arguments
 from .lattices import Bonds, Lattice
-from .spin_energy import SpinEnergy, bond_indices, checked_site_values, lattice_shape
+from .spin_energy import SpinEnergy, bond_component_indices, checked_site_values, lattice_shape
 
 
 def exchange(sites, strength=1.0, neighbours=None, periodic=True, images: bool = False) -> Energy:
@@ -86,7 +86,7 @@ def exchange(sites, strength=1.0, neighbours=None, periodic=True, images: bool =
         refuse_grid_arguments(neighbours, periodic, images)
         return crystal_exchange(sites, strength)
     shape = lattice_shape(sites)
-    if neighbours is None and _is_graph(strength, shape):
+    if neighbours is None and _is_exchange_graph(strength, shape):
         return _graph_exchange(shape, strength)
     return _lattice_bond_energy(shape, strength, None, neighbours, periodic, images, "an exchange constant")
 
@@ -122,7 +122,7 @@ def dzyaloshinskii_moriya(sites, vectors, neighbours=None, periodic=True, images
     shape = lattice_shape(sites)
     if neighbours is None and _is_edge_list(vectors) and all(np.ndim(edge[2]) == 1 for edge in vectors):
         ends, D = _checked_edges_and_vectors(vectors, math.prod(shape))
-        return Each(_antisymmetric_bond_energy, bond_indices(ends[:, 0], ends[:, 1]), D)
+        return Each(_antisymmetric_bond_energy, bond_component_indices(ends[:, 0], ends[:, 1]), D)
     return _lattice_bond_energy(shape, None, vectors, neighbours, periodic, images, "a Dzyaloshinskii-Moriya vector")
 
 
@@ -176,23 +176,28 @@ class BondEnergy(SpinEnergy):
     def couplings(self, dim: int) -> scipy.sparse.csr_array:
         site_numbers = np.arange(math.prod(self.sites)).reshape(self.sites)
         neighbour_numbers = np.roll(site_numbers, [-shift for shift in self.offset], axis=range(site_numbers.ndim))
-        return clique_pattern(bond_indices(site_numbers.ravel(), neighbour_numbers.ravel()), dim)
+        return clique_pattern(bond_component_indices(site_numbers.ravel(), neighbour_numbers.ravel()), dim)
 
 
-def _lattice_bond_energy(shape, strength, vectors, neighbours, periodic, images: bool, what: str) -> Energy:
-    axes = len(shape)
-    offsets = np.eye(axes, dtype=int).tolist() if neighbours is None else neighbours
-    offsets = [_checked_offset(offset, axes) for offset in offsets]
-    periodic_axes = (periodic,) * axes if isinstance(periodic, bool) else tuple(periodic)
-    if len(periodic_axes) != axes:
-        raise InputError(f"periodic must be True or False, or one for each of the {axes} axes, got {periodic!r}")
-    for first, second in itertools.combinations(offsets, 2):
-        opposite = [-o for o in second]
-        wrap = (lambda offset: offset) if images else functools.partial(_wrap, shape=shape, periodic=periodic_axes)
-        if wrap(first) in (wrap(second), wrap(opposite)) and any(wrap(first)):
+def _lattice_bond_energy(shape, strength, vectors, neighbours, periodic, images: bool, quantity_name: str) -> Energy:
+    """Return the exchange or antisymmetric exchange (``vectors``) of sites with neighbours at fixed offsets."""
+    n_axes = len(shape)
+    offsets = np.eye(n_axes, dtype=int).tolist() if neighbours is None else neighbours
+    offsets = [_checked_offset(offset, n_axes) for offset in offsets]
+    periodic_axes = (periodic,) * n_axes if isinstance(periodic, bool) else tuple(periodic)
+    if len(periodic_axes) != n_axes:
+        raise InputError(f"periodic must be True or False, or one for each of the {n_axes} axes, got {periodic!r}")
+    for offset_a, offset_b in itertools.combinations(offsets, 2):
+        opposite = [-o for o in offset_b]
+        wrap = (
+            (lambda offset: offset)
+            if images
+            else functools.partial(_wrap_offset, shape=shape, periodic_axes=periodic_axes)
+        )
+        if wrap(offset_a) in (wrap(offset_b), wrap(opposite)) and any(wrap(offset_a)):
             raise InputError(
-                f"the neighbours {first} and {second} name a pair twice. Give one of each two opposite offsets, and on "
-                "a periodic axis shorter ones"
+                f"the neighbours {offset_a} and {offset_b} name a pair twice. Give one of each two opposite offsets, "
+                "and on a periodic axis shorter ones"
             )
     coupling = strength if vectors is None else vectors
     couplings = (
@@ -200,39 +205,44 @@ def _lattice_bond_energy(shape, strength, vectors, neighbours, periodic, images:
         if isinstance(coupling, list | tuple) and len(coupling) == len(offsets) and np.ndim(coupling[0])
         else [coupling] * len(offsets)
     )
-    tail = () if vectors is None else (3,)
+    value_shape = () if vectors is None else (3,)
     terms = []
     for offset, offset_coupling in zip(offsets, couplings, strict=True):
-        value = checked_site_values(offset_coupling, shape, tail, what)
+        value = checked_site_values(offset_coupling, shape, value_shape, quantity_name)
         has_neighbour = _neighbour_mask(shape, offset, periodic_axes)
-        if not images and value.shape == tail:  # values given for each site are bonds that the user has counted
-            is_first = _first_bond_mask(shape, offset, periodic_axes)
-            if vectors is not None and (has_neighbour & ~is_first).any() and any(_wrap(offset, shape, periodic_axes)):
+        if not images and value.shape == value_shape:  # values given for each site are bonds that the user has counted
+            is_first = _first_bond_of_pair_mask(shape, offset, periodic_axes)
+            if (
+                vectors is not None
+                and (has_neighbour & ~is_first).any()
+                and any(_wrap_offset(offset, shape, periodic_axes))
+            ):
                 raise InputError(
-                    f"{what} has two directions for one pair, because the neighbours {offset} and "
+                    f"{quantity_name} has two directions for one pair, because the neighbours {offset} and "
                     f"{[-o for o in offset]} are one site on a periodic lattice of {shape} sites. Use periodic=False "
                     "along the short axis, more sites, or images=True to count both bonds"
                 )
             has_neighbour = has_neighbour & is_first
         if not has_neighbour.all():  # no pairs across the border
-            value = jnp.where(has_neighbour.reshape(*shape, *(1 for _ in tail)), value, 0.0)
+            value = jnp.where(has_neighbour.reshape(*shape, *(1 for _ in value_shape)), value, 0.0)
         terms.append(
             BondEnergy(shape, tuple(offset), value, None)
             if vectors is None
             else BondEnergy(shape, tuple(offset), None, value)
         )
-    return Sum.of(terms)
+    return Sum.from_terms(terms)
 
 
-def _checked_offset(offset, axes: int) -> list[int]:
+def _checked_offset(offset, n_axes: int) -> list[int]:
+    """Return an offset as a list of integers; raise InputError unless it has one for each axis and is not zero."""
     components = [offset] if np.ndim(offset) == 0 else list(offset)
-    if len(components) != axes or any(int(o) != o for o in components) or not any(components):
-        raise InputError(f"a neighbour must be an offset of {axes} integers, not all zero, got {offset!r}")
+    if len(components) != n_axes or any(int(o) != o for o in components) or not any(components):
+        raise InputError(f"a neighbour must be an offset of {n_axes} integers, not all zero, got {offset!r}")
     return [int(o) for o in components]
 
 
 def _neighbour_mask(shape, offset, periodic_axes) -> np.ndarray:
-    """Return which sites have a neighbour at an offset, as an array of the shape of the sites."""
+    """Return a mask, of the shape of the sites, of the sites that have a neighbour at an offset."""
     has_neighbour = np.ones(shape, dtype=bool)
     for axis, (n, shift, is_periodic) in enumerate(zip(shape, offset, periodic_axes, strict=True)):
         indices = np.arange(n) + shift
@@ -243,18 +253,21 @@ def _neighbour_mask(shape, offset, periodic_axes) -> np.ndarray:
     return has_neighbour
 
 
-def _wrap(offset, shape, periodic) -> list[int]:
+def _wrap_offset(offset, shape, periodic_axes) -> list[int]:
     """Return an offset modulo the lengths of the periodic axes."""
-    return [o % n if is_periodic else o for o, n, is_periodic in zip(offset, shape, periodic, strict=True)]
+    return [o % n if is_periodic else o for o, n, is_periodic in zip(offset, shape, periodic_axes, strict=True)]
 
 
-def _first_bond_mask(shape, offset, periodic_axes) -> np.ndarray:
-    """Return at which sites the bond at an offset joins two sites, and is the first that joins them."""
+def _first_bond_of_pair_mask(shape, offset, periodic_axes) -> np.ndarray:
+    """Return a mask of the sites whose bond at an offset is the first bond between its two sites.
+
+    On a periodic axis of length 1 or 2 an offset leads from a site to itself, or twice to one neighbour.
+    """
     numbers = np.arange(math.prod(shape)).reshape(shape)
-    wrapped = _wrap(offset, shape, periodic_axes)
-    if wrapped != _wrap([-o for o in offset], shape, periodic_axes):
+    wrapped_offset = _wrap_offset(offset, shape, periodic_axes)
+    if wrapped_offset != _wrap_offset([-o for o in offset], shape, periodic_axes):
         return np.ones(shape, dtype=bool)
-    return numbers < np.roll(numbers, [-o for o in wrapped], axis=range(len(shape)))
+    return numbers < np.roll(numbers, [-o for o in wrapped_offset], axis=range(len(shape)))
 
 
 def _is_edge_list(graph) -> bool:
@@ -267,10 +280,11 @@ def _is_edge_list(graph) -> bool:
 
 
 def _is_integer(value) -> bool:
+    """Return whether a value is an integer, and not a truth value."""
     return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
-def _is_graph(strength, shape: tuple[int, ...]) -> bool:
+def _is_exchange_graph(strength, shape: tuple[int, ...]) -> bool:
     """Return whether an exchange is given as a graph: as edges, or as a square matrix not shaped like the lattice."""
     if scipy.sparse.issparse(strength) or _is_edge_list(strength):
         return True
@@ -281,11 +295,12 @@ def _is_graph(strength, shape: tuple[int, ...]) -> bool:
 
 
 def _graph_exchange(shape, graph) -> Energy:
+    """Return the Heisenberg exchange along the edges of a graph of sites."""
     count = math.prod(shape)
     edges = graph_edges(graph, count, "the exchange", _SiteNames(), allow_negative=True)
     if len(edges.first) == 0:
         raise InputError("the graph of an exchange has no edges")
-    return Each(_exchange_bond_energy, bond_indices(edges.first, edges.second), edges.weight)
+    return Each(_exchange_bond_energy, bond_component_indices(edges.first, edges.second), edges.weight)
 
 
 class _SiteNames(Sequence):
@@ -298,10 +313,11 @@ class _SiteNames(Sequence):
         return 0
 
 
-def _checked_edges_and_vectors(edges, count: int) -> tuple[np.ndarray, jax.Array]:
+def _checked_edges_and_vectors(edges, n_sites: int) -> tuple[np.ndarray, jax.Array]:
+    """Return the site numbers, shape (m, 2), and vectors D, shape (m, 3), of checked edges ``(i, j, D)``."""
     for i, j, _ in edges:
-        if not (0 <= i < count and 0 <= j < count):
-            raise InputError(f"the edge ({i}, {j}) must join two of the {count} sites, which are numbered from 0")
+        if not (0 <= i < n_sites and 0 <= j < n_sites):
+            raise InputError(f"the edge ({i}, {j}) must join two of the {n_sites} sites, which are numbered from 0")
         if i == j:
             raise InputError(f"the edge ({i}, {j}) joins a site with itself")
     pairs = [frozenset(edge[:2]) for edge in edges]
@@ -314,8 +330,10 @@ def _checked_edges_and_vectors(edges, count: int) -> tuple[np.ndarray, jax.Array
 
 
 def _exchange_bond_energy(y, J):
+    """Return ``-J s_1 . s_2`` of two spins y, shape (6,)."""
     return -J * jnp.dot(y[:3], y[3:])
 
 
 def _antisymmetric_bond_energy(y, D):
+    """Return ``D . (s_1 x s_2)`` of two spins y, shape (6,)."""
     return jnp.dot(D, cross(y[:3], y[3:]))

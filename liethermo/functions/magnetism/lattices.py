@@ -37,6 +37,7 @@ _ORIGIN = ((0.0, 0.0, 0.0),)
 
 
 def _fcc_copies(motif) -> tuple[tuple[float, ...], ...]:
+    """Return the positions of a motif repeated at the four points of a face-centred cubic cell."""
     return tuple(tuple((np.add(t, r)).tolist()) for t in _FCC_TRANSLATIONS for r in motif)
 
 
@@ -120,7 +121,7 @@ def lattice(
     if isinstance(crystal, str):
         if basis is not None:
             raise InputError(f"the crystal {crystal!r} has a basis of its own. Give vectors to use basis=")
-        vectors, positions = _cell_of_name(crystal, primitive, c_over_a)
+        vectors, positions = _vectors_and_basis_of_crystal(crystal, primitive, c_over_a)
     else:
         vectors, positions = crystal, _ORIGIN if basis is None else basis
     vectors, positions = (np.array(value, dtype=float) * float(constant) for value in (vectors, positions))
@@ -142,7 +143,8 @@ def lattice(
     return result
 
 
-def _cell_of_name(name: str, primitive: bool, c_over_a: float) -> tuple:
+def _vectors_and_basis_of_crystal(name: str, primitive: bool, c_over_a: float) -> tuple:
+    """Return the cell vectors and basis positions of a named crystal, in units of the lattice constant."""
     if name == "hcp":
         return (*_TRIANGLE, (0.0, 0.0, c_over_a)), (
             (0.0, 0.0, 0.0),
@@ -154,10 +156,11 @@ def _cell_of_name(name: str, primitive: bool, c_over_a: float) -> tuple:
     return PRIMITIVE_CELLS.get(name, CRYSTALS[name]) if primitive else CRYSTALS[name]
 
 
-def _axis_values(value, axes: int, what: str) -> tuple:
-    values = (value,) * axes if np.ndim(value) == 0 else tuple(value)
-    if len(values) != axes:
-        raise InputError(f"{what} must be one value, or one for each of the {axes} axes, got {value!r}")
+def _axis_values(value, n_axes: int, quantity_name: str) -> tuple:
+    """Return a tuple of one value for each axis; a single value is repeated."""
+    values = (value,) * n_axes if np.ndim(value) == 0 else tuple(value)
+    if len(values) != n_axes:
+        raise InputError(f"{quantity_name} must be one value, or one for each of the {n_axes} axes, got {value!r}")
     return values
 
 
@@ -242,14 +245,14 @@ class Lattice(metaclass=ListedType):
         """
         axes, rows = len(self.cells), []
         for pair in pairs:
-            a, b, offset = pair if _names_atoms(pair) else (0, 0, pair)
+            a, b, offset = pair if _has_atom_indices(pair) else (0, 0, pair)
             offset = tuple(np.atleast_1d(offset).tolist())
             if len(offset) != axes or any(int(o) != o for o in offset):
                 raise InputError(f"the offset of a bond must have {axes} integers, got {offset}")
             if not (0 <= a < len(self.basis) and 0 <= b < len(self.basis)):
                 raise InputError(f"a bond must join two of the {len(self.basis)} atoms of a cell, got {a} and {b}")
             row = (int(a), int(b), *map(int, offset))
-            if row in rows or _opposite(row) in rows:
+            if row in rows or _reversed_bond_row(row) in rows:
                 raise InputError(f"the bond {pair} is given twice. Give each bond once, in one direction")
             rows.append(row)
         if not rows:
@@ -258,7 +261,7 @@ class Lattice(metaclass=ListedType):
 
     def neighbours(self, distance: float) -> Bonds:
         """Return all bonds up to a distance (length)."""
-        rows = self._rows_within(float(distance) * (1.0 + SHELL_TOLERANCE))
+        rows = self._bond_rows_within(float(distance) * (1.0 + SHELL_TOLERANCE))
         if not rows:
             raise InputError(f"no two sites of the lattice are at a distance of at most {distance:g}")
         return Bonds.from_rows(self, rows)
@@ -270,13 +273,13 @@ class Lattice(metaclass=ListedType):
         """
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
             raise InputError(f"the number of shells must be a positive integer, got {count!r}")
-        return _shells(self, int(count))
+        return _nearest_shells(self, int(count))
 
     def shell(self, number: int) -> Bonds:
         """Return the bonds of one shell: 1 for nearest neighbours, 2 for next-nearest neighbours."""
         return self.shells(number)[-1]
 
-    def _rows_within(self, distance: float) -> list[tuple[int, ...]]:
+    def _bond_rows_within(self, distance: float) -> list[tuple[int, ...]]:
         """Return the bonds up to a distance as rows ``(a, b, *offset)``, each in one direction."""
         inverse = np.linalg.pinv(self.vectors)
         rows = []
@@ -297,10 +300,11 @@ class Lattice(metaclass=ListedType):
 
 
 @functools.lru_cache(maxsize=64)
-def _shells(lattice: Lattice, count: int) -> tuple[Bonds, ...]:
+def _nearest_shells(lattice: Lattice, count: int) -> tuple[Bonds, ...]:
+    """Return the bonds of the nearest shells of neighbours of a lattice, cached."""
     distance = float(np.linalg.norm(lattice.vectors, axis=1).max())
     while True:
-        bonds = Bonds.from_rows(lattice, lattice._rows_within(distance))
+        bonds = Bonds.from_rows(lattice, lattice._bond_rows_within(distance))
         lengths = np.linalg.norm(bonds.vectors, axis=1)
         order = np.argsort(lengths, kind="stable")
         is_new_shell = np.diff(lengths[order]) > SHELL_TOLERANCE * lengths[order][:-1]
@@ -311,12 +315,13 @@ def _shells(lattice: Lattice, count: int) -> tuple[Bonds, ...]:
         distance *= 1.5
 
 
-def _names_atoms(pair) -> bool:
+def _has_atom_indices(pair) -> bool:
     """Return whether a bond is given as ``(a, b, offset)``, and not as an offset alone."""
     return isinstance(pair, tuple | list) and len(pair) == 3 and np.ndim(pair[2]) == 1
 
 
-def _opposite(row: tuple[int, ...]) -> tuple[int, ...]:
+def _reversed_bond_row(row: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the row ``(b, a, *-offset)`` of a bond ``(a, b, *offset)`` read from its other end."""
     a, b, *offset = row
     return (b, a, *(-o for o in offset))
 
@@ -389,27 +394,27 @@ class Bonds:
         """Raise InputError if a bond joins a spin with itself, or two bonds join one pair, unless images count."""
         if self.lattice.images:
             return
-        cells, seen = self.lattice.cells, {}
+        cells, bond_by_pair = self.lattice.cells, {}
         for number, (a, b, offset) in enumerate(zip(self.first, self.second, self.offsets, strict=True)):
             if not self.presence(number).any():
                 continue
-            wrapped = tuple(
+            wrapped_offset = tuple(
                 int(o) % n if is_periodic else int(o)
                 for o, n, is_periodic in zip(offset, cells, self.lattice.periodic, strict=True)
             )
             opposite = tuple(
                 -o % n if is_periodic else -o
-                for o, n, is_periodic in zip(wrapped, cells, self.lattice.periodic, strict=True)
+                for o, n, is_periodic in zip(wrapped_offset, cells, self.lattice.periodic, strict=True)
             )
-            key, reverse = (int(a), int(b), wrapped), (int(b), int(a), opposite)
-            if key == reverse or key in seen or reverse in seen:
-                problem = "a spin with itself" if a == b and not any(wrapped) else "a pair of spins twice"
+            key, reverse = (int(a), int(b), wrapped_offset), (int(b), int(a), opposite)
+            if key == reverse or key in bond_by_pair or reverse in bond_by_pair:
+                problem = "a spin with itself" if a == b and not any(wrapped_offset) else "a pair of spins twice"
                 raise InputError(
                     f"the bond ({a}, {b}, {tuple(offset.tolist())}) joins {problem}, because the lattice of {cells} "
                     "cells is periodic and short. Use more cells, periodic=False along the short axis, or images=True "
                     "to count periodic images as neighbours"
                 )
-            seen[key] = number
+            bond_by_pair[key] = number
 
     def site_pairs(self) -> np.ndarray:
         """Return the pairs of sites that are joined, numbered in C order, shape (bonds, 2)."""

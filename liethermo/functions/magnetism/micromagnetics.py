@@ -13,7 +13,7 @@ from ...errors import InputError
 from ..conditions import checked_numbers
 from ..energy import Energy
 from .bond_terms import crystal_antisymmetric_exchange, crystal_exchange
-from .dipoles import FourierKernel, kernel_energy, padded_length
+from .dipoles import FourierKernel, padded_length, pair_interaction_energy
 from .lattices import Bonds, Lattice, lattice
 from .newell import demagnetising_tensors, mirror_octant
 from .spin_energy import check_finite, checked_site_values
@@ -74,7 +74,7 @@ def continuum_exchange(cells: Lattice, stiffness) -> Energy:
     ------
     InputError
     """
-    bonds, edges = _axis_bonds(cells)
+    bonds, edges = _axis_bonds_and_edges(cells)
     A = checked_site_values(stiffness, cells.sites, (), "an exchange stiffness")
     factors = 2.0 * cells.cell_volume / edges**2
     if not A.ndim:
@@ -106,7 +106,7 @@ def continuum_antisymmetric_exchange(cells: Lattice, constant, kind: str = "inte
     InputError
     """
     D = check_finite(checked_numbers(constant, "a Dzyaloshinskii-Moriya constant", ()), "a constant")
-    bonds, edges = _axis_bonds(cells)
+    bonds, edges = _axis_bonds_and_edges(cells)
     if kind == "interfacial":
         directions = np.cross([0.0, 0.0, 1.0], bonds.directions)
     elif kind == "bulk":
@@ -145,15 +145,15 @@ def demagnetisation(cells: Lattice, saturation, constant: float = MAGNETIC_CONST
     >>> round(float(energy([0.0, 0.0, 1.0])), 12)  # half of 1 / 3
     0.166666666667
     """
-    edges = _checked_edges(cells)
+    edges = _checked_cell_edges(cells)
     if any(cells.periodic):
         raise InputError("the demagnetising field of periodic cells is not available. Use periodic=False")
-    padded = tuple(padded_length(n, False) for n in cells.cells)
-    tensors = mirror_octant(demagnetising_tensors(cells.cells, edges), padded)
+    padded_cells = tuple(padded_length(n, False) for n in cells.cells)
+    tensors = mirror_octant(demagnetising_tensors(cells.cells, edges), padded_cells)
     kernel = FourierKernel.from_tensors(tensors[:, None, None], cells.cells)
     M = checked_site_values(saturation, cells.sites, (), "a saturation magnetisation")
     strength = checked_numbers(constant, "the magnetic constant", ()) * cells.cell_volume
-    return kernel_energy(cells.sites, 3, kernel, M, strength)
+    return pair_interaction_energy(cells.sites, 3, kernel, M, strength)
 
 
 def demagnetising_factors(edges) -> np.ndarray:
@@ -179,18 +179,19 @@ def demagnetising_factors(edges) -> np.ndarray:
     return demagnetising_tensors((1, 1, 1), size)[[0, 3, 5], 0, 0, 0]
 
 
-def _checked_edges(cells: Lattice) -> np.ndarray:
-    if not isinstance(cells, Lattice) or len(cells.cells) != 3 or len(cells.basis) != 1:
+def _checked_cell_edges(mesh: Lattice) -> np.ndarray:
+    """Return the edges of the cells of a mesh, shape (3,); raise InputError unless the cells are rectangular."""
+    if not isinstance(mesh, Lattice) or len(mesh.cells) != 3 or len(mesh.basis) != 1:
         raise InputError("cells must be those of lt.magnetism.mesh")
-    edges = np.diag(cells.vectors)
-    if not np.array_equal(cells.vectors, np.diag(edges)) or not (edges > 0.0).all():
+    edges = np.diag(mesh.vectors)
+    if not np.array_equal(mesh.vectors, np.diag(edges)) or not (edges > 0.0).all():
         raise InputError("cells must be rectangular, as those of lt.magnetism.mesh")
     return edges
 
 
-def _axis_bonds(cells: Lattice) -> tuple[Bonds, np.ndarray]:
+def _axis_bonds_and_edges(cells: Lattice) -> tuple[Bonds, np.ndarray]:
     """Return the bonds along each axis with more than one cell, and the lengths of the cells along them."""
-    edges = _checked_edges(cells)
+    edges = _checked_cell_edges(cells)
     axes = [axis for axis, n in enumerate(cells.cells) if n > 1] or [0]
     offsets = np.eye(3, dtype=int)[axes].tolist()
     return cells.bonds([tuple(offset) for offset in offsets]), edges[axes]

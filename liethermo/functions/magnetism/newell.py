@@ -42,18 +42,21 @@ def demagnetising_tensors(cells: tuple[int, ...], size: np.ndarray) -> np.ndarra
     distances = np.linalg.norm(offsets * edges, axis=1)
     tensors = np.zeros((6, len(offsets)))
     is_near = distances <= CLOSED_FORM_DISTANCE
-    tensors[:, is_near] = _closed_form(offsets[is_near], edges)
-    lower = CLOSED_FORM_DISTANCE
-    for upper, nodes in FAR_NODES:
-        is_far = (distances > lower) & (distances <= upper)
+    tensors[:, is_near] = _closed_form_tensors(offsets[is_near], edges)
+    min_distance = CLOSED_FORM_DISTANCE
+    for max_distance, nodes in FAR_NODES:
+        is_far = (distances > min_distance) & (distances <= max_distance)
         tensors[:, is_far] = _mean_dipole_tensors(offsets[is_far] * edges, edges, nodes)
-        lower = upper
+        min_distance = max_distance
     return tensors.reshape(6, *cells)
 
 
-def mirror_octant(tensors: np.ndarray, padded: tuple[int, ...]) -> np.ndarray:
-    """Return tensors on a padded grid, offsets 0, 1, …, -1 along each axis, from those of positive offsets."""
-    result = np.zeros((6, *padded))
+def mirror_octant(tensors: np.ndarray, padded_cells: tuple[int, ...]) -> np.ndarray:
+    """Return tensors at all offsets of a padded grid, 0, 1, …, -1 along each axis, from those at offsets >= 0.
+
+    The tensors at negative offsets follow by mirror symmetry.
+    """
+    result = np.zeros((6, *padded_cells))
     cells = tensors.shape[1:]
     for component, (i, j) in enumerate(COMPONENTS):
         for signs in itertools.product((1, -1), repeat=3):
@@ -62,33 +65,36 @@ def mirror_octant(tensors: np.ndarray, padded: tuple[int, ...]) -> np.ndarray:
             source = tuple(slice(0, n) if s > 0 else slice(1, n) for s, n in zip(signs, cells, strict=True))
             target = tuple(
                 slice(0, n) if s > 0 else slice(length - 1, length - n, -1)
-                for s, n, length in zip(signs, cells, padded, strict=True)
+                for s, n, length in zip(signs, cells, padded_cells, strict=True)
             )
             result[component][target] = signs[i] * signs[j] * tensors[component][source]
     return result
 
 
-def _closed_form(offsets: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Return the tensors of cells at integer offsets, shape (6, n), in the widest floating-point format."""
-    wide = np.asarray(edges, dtype=np.longdouble)
+def _closed_form_tensors(offsets: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Return the demagnetising tensors of cells at integer offsets, shape (6, n), by Newell's closed form.
+
+    They are computed in the widest floating-point format.
+    """
+    wide_edges = np.asarray(edges, dtype=np.longdouble)
     result = np.zeros((6, len(offsets)), dtype=np.longdouble)
     for shift in itertools.product((-1, 0, 1), repeat=3):
         weight = np.prod([2.0 if s == 0 else -1.0 for s in shift])
-        x, y, z = ((offsets + shift) * wide).T
+        x, y, z = ((offsets + shift) * wide_edges).T
         values = (
-            _diagonal_function(x, y, z),
-            _mixed_function(x, y, z),
-            _mixed_function(x, z, y),
-            _diagonal_function(y, x, z),
-            _mixed_function(y, z, x),
-            _diagonal_function(z, y, x),
+            _newell_f(x, y, z),
+            _newell_g(x, y, z),
+            _newell_g(x, z, y),
+            _newell_f(y, x, z),
+            _newell_g(y, z, x),
+            _newell_f(z, y, x),
         )
         for component, value in enumerate(values):
             result[component] += weight * value
-    return np.asarray(result / (4.0 * np.longdouble(np.pi) * np.prod(wide)), dtype=float)
+    return np.asarray(result / (4.0 * np.longdouble(np.pi) * np.prod(wide_edges)), dtype=float)
 
 
-def _diagonal_function(x, y, z):
+def _newell_f(x, y, z):
     """Return Newell's function f(x, y, z), even in each argument [Newell, Williams & Dunlop 1993, eq. 27]."""
     x, y, z = np.abs(x), np.abs(y), np.abs(z)
     r = np.sqrt(x * x + y * y + z * z)
@@ -100,7 +106,7 @@ def _diagonal_function(x, y, z):
     )
 
 
-def _mixed_function(x, y, z):
+def _newell_g(x, y, z):
     """Return Newell's function g(x, y, z), odd in x and y and even in z [Newell, Williams & Dunlop 1993, eq. 32]."""
     z = np.abs(z)
     r = np.sqrt(x * x + y * y + z * z)
@@ -128,9 +134,9 @@ def _atan_ratio(a, b):
         return np.where(b != 0.0, np.arctan(a / b), 0.0)
 
 
-def _mean_dipole_tensors(r: np.ndarray, edges: np.ndarray, nodes: int) -> np.ndarray:
+def _mean_dipole_tensors(r: np.ndarray, edges: np.ndarray, n_nodes: int) -> np.ndarray:
     """Return ``V / 4 pi`` times the mean of the dipolar tensor over the vectors between two cells, shape (6, n)."""
-    points, weights = triangle_rule(nodes)
+    points, weights = triangle_density_gauss_rule(n_nodes)
     total = np.zeros((6, len(r)))
     for (a, u), (b, v), (c, w) in itertools.product(enumerate(points), repeat=3):
         tensor = dipole_tensor(r + np.array([u, v, w]) * edges)
@@ -140,20 +146,20 @@ def _mean_dipole_tensors(r: np.ndarray, edges: np.ndarray, nodes: int) -> np.nda
 
 
 @functools.cache
-def triangle_rule(nodes: int) -> tuple[np.ndarray, np.ndarray]:
+def triangle_density_gauss_rule(n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
     """Return points and weights of Gauss quadrature with the density ``1 - |t|`` on [-1, 1].
 
     The recurrence of the orthogonal polynomials is computed by the Stieltjes procedure [Gautschi 2004].
     """
-    t, w = np.polynomial.legendre.leggauss(2 * nodes + 2)
+    t, w = np.polynomial.legendre.leggauss(2 * n_nodes + 2)
     t, w = np.concatenate([0.5 * (t - 1.0), 0.5 * (t + 1.0)]), np.tile(0.5 * w, 2)
     w = w * (1.0 - np.abs(t))
     previous, current = np.zeros_like(t), np.ones_like(t)
     beta: list[float] = []
     norm = np.sum(w)
-    for _ in range(nodes - 1):  # the density is even, so the diagonal of the matrix is 0
-        last = beta[-1] if beta else 0.0
-        previous, current = current, t * current - last * previous
+    for _ in range(n_nodes - 1):  # the density is even, so the diagonal of the matrix is 0
+        previous_beta = beta[-1] if beta else 0.0
+        previous, current = current, t * current - previous_beta * previous
         new_norm = np.sum(w * current**2)
         beta.append(new_norm / norm)
         norm = new_norm

@@ -61,7 +61,7 @@ def read_ovf(path) -> VectorField:
     Raises
     ------
     FileError
-        If the file is no rectangular OVF file, or is damaged.
+        If the file is not a rectangular OVF file, or is damaged.
     """
     name = os.fspath(path)
     try:
@@ -154,12 +154,13 @@ def write_ovf(
 
 
 def _header_lines(array: np.ndarray, edges, base, version: int, title: str, unit: str) -> list[str]:
+    """Return the lines of the header of an OVF file, without the leading ``# ``."""
     nodes, dim = array.shape[:3], array.shape[3]
-    first = "OOMMF OVF 2.0" if version == 2 else "OOMMF: rectangular mesh v1.0"
-    lines = [first, "Segment count: 1", "Begin: Segment", "Begin: Header", f"Title: {title}"]
+    first_line = "OOMMF OVF 2.0" if version == 2 else "OOMMF: rectangular mesh v1.0"
+    lines = [first_line, "Segment count: 1", "Begin: Segment", "Begin: Header", f"Title: {title}"]
     lines += ["meshtype: rectangular", "meshunit: m"]
-    low, high = base - edges / 2.0, base + (np.array(nodes) - 0.5) * edges
-    for axis, a, b, c, e, n in zip("xyz", low, high, base, edges, nodes, strict=True):
+    min_corner, max_corner = base - edges / 2.0, base + (np.array(nodes) - 0.5) * edges
+    for axis, a, b, c, e, n in zip("xyz", min_corner, max_corner, base, edges, nodes, strict=True):
         lines += [f"{axis}min: {a:.17g}", f"{axis}max: {b:.17g}", f"{axis}base: {c:.17g}"]
         lines += [f"{axis}nodes: {n}", f"{axis}stepsize: {e:.17g}"]
     if version == 2:
@@ -172,7 +173,7 @@ def _header_lines(array: np.ndarray, edges, base, version: int, title: str, unit
     return [*lines, "End: Header"]
 
 
-def _parse_header(content: bytes, name: str) -> tuple[int, dict[str, str], str, int]:
+def _parse_header(content: bytes, file_name: str) -> tuple[int, dict[str, str], str, int]:
     """Return the version, the entries of the header, the kind of the data, and where they begin."""
     header: dict[str, str] = {}
     position, version = 0, 0
@@ -182,7 +183,7 @@ def _parse_header(content: bytes, name: str) -> tuple[int, dict[str, str], str, 
         line = content[position:end].decode("latin-1").strip()
         position = end + 1
         if not version:
-            version = _version_of_line(line, name)
+            version = _version_of_line(line, file_name)
             continue
         text = line.lstrip("#").split("##")[0].strip()
         key, _, value = text.partition(":")
@@ -190,37 +191,41 @@ def _parse_header(content: bytes, name: str) -> tuple[int, dict[str, str], str, 
         if key == "begin" and value.strip().lower().startswith("data"):
             return version, header, " ".join(value.lower().split()[1:]), position
         header.setdefault(key, value.strip())
-    raise FileError(f"{name} has no data: the line '# Begin: Data' is missing")
+    raise FileError(f"{file_name} has no data: the line '# Begin: Data' is missing")
 
 
-def _version_of_line(line: str, name: str) -> int:
+def _version_of_line(line: str, file_name: str) -> int:
+    """Return the OVF version, 1 or 2, that the first line of a file names; raise FileError for another line."""
     text = line.lstrip("# ").lower()
     if text.startswith("oommf"):
         if text.endswith("2.0"):
             return 2
         if "v1.0" in text or text.endswith("1.0") or "v0.99" in text:
             return 1
-    raise FileError(f"{name} is not an OVF file of version 1.0 or 2.0: its first line is {line[:60]!r}")
+    raise FileError(f"{file_name} is not an OVF file of version 1.0 or 2.0: its first line is {line[:60]!r}")
 
 
-def _read_data(content: bytes, start: int, kind: str, version: int, count: int, name: str) -> np.ndarray:
-    if kind == "text":
-        end = content.find(b"#", start)
-        words = content[start : end if end >= 0 else len(content)].split()
+def _read_data(
+    content: bytes, data_start: int, data_kind: str, version: int, n_numbers: int, file_name: str
+) -> np.ndarray:
+    """Return ``n_numbers`` numbers from the data of an OVF file, from ``data_start`` on; raise FileError if damaged."""
+    if data_kind == "text":
+        end = content.find(b"#", data_start)
+        words = content[data_start : end if end >= 0 else len(content)].split()
         try:
             numbers = np.array(words, dtype=float)
         except ValueError as error:
-            raise FileError(f"{name} has data that are no numbers: {error}") from error
-        if len(numbers) != count:
-            raise FileError(f"{name} must have {count} numbers, got {len(numbers)}. The file is not complete")
+            raise FileError(f"{file_name} has data that are not numbers: {error}") from error
+        if len(numbers) != n_numbers:
+            raise FileError(f"{file_name} must have {n_numbers} numbers, got {len(numbers)}. The file is not complete")
         return numbers
-    if kind not in ("binary 4", "binary 8"):
-        raise FileError(f"{name} has data of the kind {kind!r}. Text, binary 4 and binary 8 are read")
-    width = int(kind[-1])
-    if len(content) < start + width * (count + 1):
-        raise FileError(f"{name} is not complete: it must have {count} numbers of {width} bytes")
+    if data_kind not in ("binary 4", "binary 8"):
+        raise FileError(f"{file_name} has data of the kind {data_kind!r}. Text, binary 4 and binary 8 are read")
+    width = int(data_kind[-1])
+    if len(content) < data_start + width * (n_numbers + 1):
+        raise FileError(f"{file_name} is not complete: it must have {n_numbers} numbers of {width} bytes")
     for order in "<>" if version == 2 else "><":
-        numbers = np.frombuffer(content, dtype=np.dtype(f"{order}f{width}"), count=count + 1, offset=start)
+        numbers = np.frombuffer(content, dtype=np.dtype(f"{order}f{width}"), count=n_numbers + 1, offset=data_start)
         if numbers[0] == CHECK_VALUES[width]:
             return numbers[1:].astype(float)
-    raise FileError(f"{name} is damaged: its data do not begin with the number {CHECK_VALUES[width]:.0f}")
+    raise FileError(f"{file_name} is damaged: its data do not begin with the number {CHECK_VALUES[width]:.0f}")

@@ -92,7 +92,9 @@ def minimise(energy, spins, tolerance: float = 1e-8, max_steps: int = 100_000) -
         function, is_flat = make_energy(energy, "the energy"), True
     else:
         function, is_flat = make_energy(energy, "the energy"), False
-    result = _descend(function, is_flat, start / lengths, lengths, jnp.asarray(tolerance), jnp.asarray(max_steps))
+    result = _descend_to_minimum(
+        function, is_flat, start / lengths, lengths, jnp.asarray(tolerance), jnp.asarray(max_steps)
+    )
     unit_vectors, value, torque, steps = jax.device_get(result)
     if not torque <= tolerance:
         raise ConvergenceError(
@@ -103,8 +105,8 @@ def minimise(energy, spins, tolerance: float = 1e-8, max_steps: int = 100_000) -
     return Minimum(unit_vectors * np.asarray(lengths), float(value), float(torque), int(steps))
 
 
-class _Descent(NamedTuple):
-    """State of a descent: unit vectors, energy, tangential gradient, torque, step size, number of attempts."""
+class _DescentState(NamedTuple):
+    """State of a gradient descent: unit vectors, energy, tangential gradient, torque, step size, attempts so far."""
 
     u: jax.Array
     value: jax.Array
@@ -115,46 +117,50 @@ class _Descent(NamedTuple):
 
 
 @eqx.filter_jit
-def _descend(energy: Energy, is_flat: bool, u, lengths, tolerance, max_steps):
-    def value_and_slope(u):
-        s = u * lengths
+def _descend_to_minimum(energy: Energy, is_flat: bool, unit_vectors, lengths, tolerance, max_steps):
+    """Return the unit vectors, energy and relative torque of a minimum, and the number of steps that found it."""
+
+    def value_and_slope(unit_vectors):
+        s = unit_vectors * lengths
         x = s.reshape(-1) if is_flat else s
-        gradient = lengths * (energy.gradient(x) if is_flat else jax.grad(energy.value)(x)).reshape(u.shape)
-        slope = gradient - jnp.sum(gradient * u, axis=-1, keepdims=True) * u
+        gradient = lengths * (energy.gradient(x) if is_flat else jax.grad(energy.value)(x)).reshape(unit_vectors.shape)
+        slope = gradient - jnp.sum(gradient * unit_vectors, axis=-1, keepdims=True) * unit_vectors
         torque = jnp.max(jnp.linalg.norm(slope, axis=-1))
         scale = jnp.max(jnp.linalg.norm(gradient, axis=-1))
         return energy.value(x), slope, torque / jnp.where(scale > 0.0, scale, 1.0), scale
 
-    def rotate(u, slope, step):
+    def rotate(unit_vectors, slope, step):
         # u' = ((4 - a^2) u - 4 step slope) / (4 + a^2), a = step |slope|: a rotation by 2 atan(a / 2)
         square = step**2 * jnp.sum(slope**2, axis=-1, keepdims=True)
-        return ((4.0 - square) * u - 4.0 * step * slope) / (4.0 + square)
+        return ((4.0 - square) * unit_vectors - 4.0 * step * slope) / (4.0 + square)
 
-    def limit(step, slope):
+    def limit_rotation(step, slope):
         return jnp.minimum(step, MAX_ROTATION / jnp.maximum(jnp.max(jnp.linalg.norm(slope, axis=-1)), 1e-300))
 
-    def attempt(state: _Descent) -> _Descent:
-        u = rotate(state.u, state.slope, state.step)
-        u = u / jnp.linalg.norm(u, axis=-1, keepdims=True)
-        value, slope, torque, scale = value_and_slope(u)
+    def attempt_step(state: _DescentState) -> _DescentState:
+        unit_vectors = rotate(state.u, state.slope, state.step)
+        unit_vectors = unit_vectors / jnp.linalg.norm(unit_vectors, axis=-1, keepdims=True)
+        value, slope, torque, scale = value_and_slope(unit_vectors)
         decrease = SUFFICIENT_DECREASE * state.step * jnp.sum(state.slope**2)
-        rounding = ENERGY_ROUNDING * (jnp.abs(state.value) + scale * jnp.sqrt(u.size / 3.0))
+        rounding = ENERGY_ROUNDING * (jnp.abs(state.value) + scale * jnp.sqrt(unit_vectors.size / 3.0))
         is_accepted = value <= state.value - decrease + rounding
-        du, dslope = u - state.u, slope - state.slope
+        du, dslope = unit_vectors - state.u, slope - state.slope
         curvature = jnp.sum(du * dslope)
         long_step = jnp.sum(du**2) / jnp.where(curvature > 0.0, curvature, 1.0)
         short_step = curvature / jnp.maximum(jnp.sum(dslope**2), 1e-300)
         next_step = jnp.where(
             curvature > 0.0, jnp.where(state.attempts % 2 == 0, long_step, short_step), 2.0 * state.step
         )
-        accepted = _Descent(u, value, slope, torque, limit(next_step, slope), state.attempts + 1)
-        rejected = state._replace(step=0.25 * state.step, attempts=state.attempts + 1)
-        return jax.tree_util.tree_map(lambda a, b: jnp.where(is_accepted, a, b), accepted, rejected)
+        accepted_state = _DescentState(
+            unit_vectors, value, slope, torque, limit_rotation(next_step, slope), state.attempts + 1
+        )
+        rejected_state = state._replace(step=0.25 * state.step, attempts=state.attempts + 1)
+        return jax.tree_util.tree_map(lambda a, b: jnp.where(is_accepted, a, b), accepted_state, rejected_state)
 
-    value, slope, torque, scale = value_and_slope(u)
-    first_step = limit(1.0 / jnp.where(scale > 0.0, scale, 1.0), slope)
-    start = _Descent(u, value, slope, torque, first_step, jnp.zeros((), dtype=int))
-    end = jax.lax.while_loop(lambda s: (s.torque > tolerance) & (s.attempts < max_steps), attempt, start)
+    value, slope, torque, scale = value_and_slope(unit_vectors)
+    first_step = limit_rotation(1.0 / jnp.where(scale > 0.0, scale, 1.0), slope)
+    start = _DescentState(unit_vectors, value, slope, torque, first_step, jnp.zeros((), dtype=int))
+    end = jax.lax.while_loop(lambda s: (s.torque > tolerance) & (s.attempts < max_steps), attempt_step, start)
     return end.u, end.value, end.torque, end.attempts
 
 

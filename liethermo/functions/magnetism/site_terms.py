@@ -58,8 +58,8 @@ def anisotropy(sites, strength=1.0, axis=(0.0, 0.0, 1.0)) -> Energy:
     K = checked_site_values(strength, shape, (), "an anisotropy constant")
     n = checked_site_values(axis, shape, (3,), "an axis")
     if not is_traced((K, n)) and not (np.count_nonzero(np.asarray(n), axis=-1) > 1).any():  # every axis is x, y or z
-        return SiteEnergy(shape, -2.0 * K[..., None] * n**2, None, None)
-    return SiteEnergy(shape, -2.0 * K, None, n)
+        return QuadraticSiteEnergy(shape, -2.0 * K[..., None] * n**2, None, None)
+    return QuadraticSiteEnergy(shape, -2.0 * K, None, n)
 
 
 def uniaxial_anisotropy(sites, coefficients: Mapping, axis=(0.0, 0.0, 1.0)) -> Energy:
@@ -193,6 +193,7 @@ def polynomial_anisotropy(sites, terms: Mapping, axes=None) -> Energy:
 
 
 def _is_power_triple(powers) -> bool:
+    """Return whether a value is a tuple of three non-negative integers."""
     return (
         isinstance(powers, tuple)
         and len(powers) == 3
@@ -234,7 +235,7 @@ def zeeman(sites, field, moment=1.0) -> Energy:
             raise InputError(f"a field of the time must have shape (3,) or {(*shape, 3)}, got {result.shape}")
         return TimeDependent(DrivenZeeman(field, moment, shape))
     B = checked_site_values(field, shape, (3,), "a field")
-    return SiteEnergy(shape, None, -moment[..., None] * B, None)
+    return QuadraticSiteEnergy(shape, None, -moment[..., None] * B, None)
 
 
 class DrivenZeeman(Module):
@@ -296,7 +297,7 @@ def stevens_monomials(k: int, q: int) -> dict[tuple[int, int, int], float]:
     return {powers: value for powers, value in result.items() if value}
 
 
-class SiteEnergy(SpinEnergy):
+class QuadraticSiteEnergy(SpinEnergy):
     """The energy ``sum_i A_i (n_i . s_i)^2 / 2 + b_i . s_i``; without n, the first term is ``sum_ic A_ic s_ic^2 / 2``.
 
     Attributes
@@ -337,7 +338,7 @@ class SiteEnergy(SpinEnergy):
 
     def multiple(self, factor) -> Energy:
         A, b = (None if value is None else factor * value for value in (self.A, self.b))
-        return SiteEnergy(self.sites, A, b, self.n)
+        return QuadraticSiteEnergy(self.sites, A, b, self.n)
 
 
 class SitePolynomial(SpinEnergy):
@@ -363,7 +364,8 @@ class SitePolynomial(SpinEnergy):
     def is_quadratic(self) -> bool:
         return self.degree <= 2.0
 
-    def _components(self, spins: VectorComponents) -> VectorComponents:
+    def _components_in_frame(self, spins: VectorComponents) -> VectorComponents:
+        """Return the components of the spins along the vectors of the frame, each of the shape of the sites."""
         if self.frame is None:
             return spins
         a, b, c = (dot_vectors(split_vectors(self.frame[..., axis, :]), spins) for axis in range(3))
@@ -382,19 +384,19 @@ class SitePolynomial(SpinEnergy):
         for powers, c in zip(self.powers, self.coefficients, strict=True):
             for axis in range(3):
                 if powers[axis]:
-                    lower = tuple(p - int(a == axis) for a, p in enumerate(powers))
-                    slopes[axis] = slopes[axis] + powers[axis] * c * _monomial(tables, lower, self.sites)
+                    lowered_powers = tuple(p - int(a == axis) for a, p in enumerate(powers))
+                    slopes[axis] = slopes[axis] + powers[axis] * c * _monomial(tables, lowered_powers, self.sites)
         if self.frame is None:
             return slopes[0], slopes[1], slopes[2]
-        first, second, third = (
+        x_gradients, y_gradients, z_gradients = (
             scale_vectors(slopes[axis], split_vectors(self.frame[..., axis, :])) for axis in range(3)
         )
-        return add_vectors(add_vectors(first, second), third)
+        return add_vectors(add_vectors(x_gradients, y_gradients), z_gradients)
 
     def _power_tables(self, spins: PeriodicSpins) -> list[list[jax.Array]]:
-        """Return the powers 1, 2, … of each component, shape of the sites."""
+        """Return a list of the powers 1, 2, … of the spins for each of their components in the frame."""
         tables = []
-        for axis, component in enumerate(self._components(spins.site_spins)):
+        for axis, component in enumerate(self._components_in_frame(spins.site_spins)):
             table = [component]
             for _ in range(1, max(powers[axis] for powers in self.powers)):
                 table.append(table[-1] * component)
@@ -409,5 +411,6 @@ class SitePolynomial(SpinEnergy):
 
 
 def _monomial(tables: list[list[jax.Array]], powers, sites: tuple[int, ...]) -> jax.Array:
+    """Return the product of powers of the components on each site, from tables of the powers 1, 2, …."""
     factors = [table[p - 1] for table, p in zip(tables, powers, strict=True) if p]
     return math.prod(factors[1:], start=factors[0]) if factors else jnp.ones(sites)

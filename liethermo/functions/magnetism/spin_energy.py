@@ -49,7 +49,7 @@ class SpinEnergy(Energy):
 
     @abstractmethod
     def lattice_gradients(self, spins: PeriodicSpins) -> VectorComponents:
-        """Return the gradients by the spins."""
+        """Return the gradient by each spin, as three arrays of components of the shape of the sites."""
 
     @property
     def is_quadratic(self) -> bool:
@@ -66,6 +66,9 @@ class SpinEnergy(Energy):
 
     def check_components(self, dim: int, role: str) -> None:
         check_spin_count(self.sites, dim, role)
+
+    def flattened_states(self, x) -> jax.Array:
+        return flattened_spins(x, self.sites)
 
 
 def lattice_spins(x, sites: tuple[int, ...], planar: bool = False) -> VectorComponents:
@@ -89,6 +92,22 @@ def lattice_shape(sites) -> tuple[int, ...]:
     return tuple(int(n) for n in shape)
 
 
+def flattened_spins(x, sites: tuple[int, ...]) -> jax.Array:
+    """Return states, shape (..., n), from such states or from spins, shape ``(..., *sites, 3)``.
+
+    Raises
+    ------
+    InputError
+        If the shape is neither.
+    """
+    n, shape = 3 * math.prod(sites), (*sites, 3)
+    if x.shape[-1:] >= (n,):
+        return x
+    if x.shape[-len(shape) :] != shape:
+        raise InputError(f"spins must have shape (..., {', '.join(map(str, shape))}) or (..., {n}), got {x.shape}")
+    return x.reshape(*x.shape[: -len(shape)], n)
+
+
 def check_spin_count(sites: tuple[int, ...], dim: int, role: str) -> None:
     """Raise InputError if a state has fewer components than the spins of a term."""
     count = math.prod(sites)
@@ -96,23 +115,26 @@ def check_spin_count(sites: tuple[int, ...], dim: int, role: str) -> None:
         raise InputError(f"{role} has a term of {count} spins, so the state needs {3 * count} components, got {dim}")
 
 
-def checked_site_values(value, shape, tail: tuple[int, ...], what: str) -> jax.Array:
+def checked_site_values(value, shape, entry_shape: tuple[int, ...], quantity_name: str) -> jax.Array:
     """Return a value, given once or for each site, as an array; InputError unless its shape fits and it is finite."""
-    array = checked_numbers(value, what)
-    if array.shape not in (tail, (*shape, *tail)):
-        expected_shapes = f"{tail} or {(*shape, *tail)}" if tail else f"() or {shape}"
-        raise InputError(f"{what} must have shape {expected_shapes}, got {array.shape}")
-    return check_finite(array, what)
+    array = checked_numbers(value, quantity_name)
+    if array.shape not in (entry_shape, (*shape, *entry_shape)):
+        expected_shapes = f"{entry_shape} or {(*shape, *entry_shape)}" if entry_shape else f"() or {shape}"
+        raise InputError(f"{quantity_name} must have shape {expected_shapes}, got {array.shape}")
+    return check_finite(array, quantity_name)
 
 
-def check_finite(array: jax.Array, what: str) -> jax.Array:
+def check_finite(array: jax.Array, quantity_name: str) -> jax.Array:
     """Return an array; raise InputError unless its numbers are finite."""
     if not is_traced(array) and not np.isfinite(np.asarray(array)).all():
-        raise InputError(f"{what} must be finite, got {np.asarray(array).tolist()}")
+        raise InputError(f"{quantity_name} must be finite, got {np.asarray(array).tolist()}")
     return array
 
 
-def bond_indices(first, second) -> np.ndarray:
-    """Return the indices of the components of two spins, shape (edges, 6)."""
-    ends = np.stack([first, second], axis=1)
+def bond_component_indices(first_sites, second_sites) -> np.ndarray:
+    """Return the indices into a state of the components of both spins of each bond, shape (bonds, 6).
+
+    The spins are given by their site numbers, shape (bonds,) each.
+    """
+    ends = np.stack([first_sites, second_sites], axis=1)
     return (3 * ends[:, :, None] + np.arange(3)).reshape(len(ends), 6)

@@ -46,7 +46,7 @@ class Slonczewski(Module):
         self.field_like = _checked_amplitude(field_like)
 
     def __call__(self, t, s):
-        a, b = _amplitude(self.damping_like, t), _amplitude(self.field_like, t)
+        a, b = _evaluate_amplitude(self.damping_like, t), _evaluate_amplitude(self.field_like, t)
         return a * cross(s, self.polarisation) + b * self.polarisation
 
 
@@ -119,21 +119,24 @@ class ZhangLi(Module):
         return cross(s, derivative) + self.beta * derivative
 
 
-def _central_difference(s, axis: int, edge: float, is_periodic: bool) -> jax.Array:
-    ahead, behind = jnp.roll(s, -1, axis), jnp.roll(s, 1, axis)
+def _central_difference(s, axis: int, spacing: float, is_periodic: bool) -> jax.Array:
+    """Return the derivative of spins along an axis by central differences, one-sided at open borders."""
+    next_values, previous_values = jnp.roll(s, -1, axis), jnp.roll(s, 1, axis)
     if is_periodic:
-        return (ahead - behind) / (2.0 * edge)
+        return (next_values - previous_values) / (2.0 * spacing)
     index = np.arange(s.shape[axis]).reshape([-1 if a == axis else 1 for a in range(s.ndim)])
     is_first, is_last = index == 0, index == s.shape[axis] - 1
-    spacing = jnp.where(is_first | is_last, edge, 2.0 * edge)
-    return (jnp.where(is_last, s, ahead) - jnp.where(is_first, s, behind)) / spacing
+    local_spacing = jnp.where(is_first | is_last, spacing, 2.0 * spacing)
+    return (jnp.where(is_last, s, next_values) - jnp.where(is_first, s, previous_values)) / local_spacing
 
 
 def _checked_amplitude(value):
+    """Return the amplitude of a torque: a function of the time unchanged, or checked numbers."""
     return value if callable(value) else checked_numbers(value, "the amplitude of a torque")
 
 
-def _amplitude(value, t) -> jax.Array:
+def _evaluate_amplitude(value, t) -> jax.Array:
+    """Return an amplitude at a time, with a trailing axis for the components of spins if it varies."""
     amplitude = jnp.asarray(value(t) if callable(value) else value)
     return amplitude[..., None] if amplitude.ndim else amplitude
 
@@ -162,8 +165,8 @@ def checked_spin_torque(torque, sites: tuple[int, ...]) -> tuple[Callable, ...]:
     except IndexOutOfRangeError as error:
         raise error.with_function(f"the torque, at spins of shape {shape},") from None
     except TRACE_ERRORS as error:
-        what = f"the torque could not be evaluated on spins of shape {shape}"
-        raise FunctionError(trace_error_message(what, error)) from error
+        subject = f"the torque could not be evaluated on spins of shape {shape}"
+        raise FunctionError(trace_error_message(subject, error)) from error
     for value in values:
         if value.shape not in (shape, (3,)) or not jnp.issubdtype(value.dtype, jnp.floating):
             raise FunctionError(

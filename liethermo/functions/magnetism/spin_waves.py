@@ -56,7 +56,7 @@ def spin_wave_frequencies(
     Raises
     ------
     InputError
-        If the state is no state of rest, or does not repeat.
+        If the state is not at rest, or does not repeat.
 
     Examples
     --------
@@ -76,20 +76,20 @@ def spin_wave_frequencies(
     repeat = (1,) * len(lattice.cells) if magnetic_cell is None else tuple(magnetic_cell)
     if len(repeat) != len(lattice.cells) or any(n % m for n, m in zip(lattice.cells, repeat, strict=True)):
         raise InputError(f"magnetic_cell must divide the cells {lattice.cells}, got {repeat}")
-    _check_repeats(s, lattice, repeat)
+    _check_spins_repeat(s, lattice, repeat)
     gradient = np.asarray(function.gradient(s.ravel())).reshape(-1, 3)
-    flat = s.reshape(-1, 3)
-    torques = np.linalg.norm(np.cross(flat, gradient), axis=1) / np.linalg.norm(flat, axis=1)
+    flat_spins = s.reshape(-1, 3)
+    torques = np.linalg.norm(np.cross(flat_spins, gradient), axis=1) / np.linalg.norm(flat_spins, axis=1)
     if torques.max() > REST_TOLERANCE * max(np.linalg.norm(gradient, axis=1).max(), 1e-300):
         raise InputError(
             "spins must be a state of rest, but their torques do not vanish. Use lt.magnetism.minimise first"
         )
-    numbers, members, offsets = _cell_members(lattice, repeat)
-    frames = np.empty((len(flat), 2, 3))
-    frames[numbers] = _local_frames(flat[members])
-    lengths = np.linalg.norm(flat[members], axis=1)
-    rows = _hessian_rows(function, flat, members, frames)
-    radial_slopes = np.sum(gradient[members] * flat[members], axis=1) / lengths**2
+    numbers, members, offsets = _magnetic_cell_sites_and_offsets(lattice, repeat)
+    frames = np.empty((len(flat_spins), 2, 3))
+    frames[numbers] = _local_frames(flat_spins[members])
+    lengths = np.linalg.norm(flat_spins[members], axis=1)
+    rows = _hessian_rows(function, flat_spins, members, frames)
+    radial_slopes = np.sum(gradient[members] * flat_spins[members], axis=1) / lengths**2
     count = len(members)
     for k, i in enumerate(members):  # a spin moves on a sphere, whose curvature adds the slope along the spin
         rows[2 * k : 2 * k + 2, i] -= radial_slopes[k] * np.eye(2)
@@ -104,11 +104,11 @@ def spin_wave_frequencies(
     return np.stack(frequencies).reshape(*q.shape[:-1], count)
 
 
-def _positive_frequencies(values: np.ndarray, count: int) -> np.ndarray:
-    """Return the larger half of the eigenvalues, which are real for a stable state."""
-    scale = max(np.abs(values).max(), 1e-300)
-    real = np.where(np.abs(values.imag) <= IMAGINARY_TOLERANCE * scale, values.real, np.nan)
-    upper = np.sort(real)[-count:] if np.isnan(real).any() else np.sort(real)[count:]
+def _positive_frequencies(eigenvalues: np.ndarray, n_frequencies: int) -> np.ndarray:
+    """Return the ``n_frequencies`` largest eigenvalues, in ascending order; NaN for one that is not real."""
+    scale = max(np.abs(eigenvalues).max(), 1e-300)
+    real = np.where(np.abs(eigenvalues.imag) <= IMAGINARY_TOLERANCE * scale, eigenvalues.real, np.nan)
+    upper = np.sort(real)[-n_frequencies:] if np.isnan(real).any() else np.sort(real)[n_frequencies:]
     return np.where(np.abs(upper) <= IMAGINARY_TOLERANCE * scale, np.abs(upper), upper)
 
 
@@ -116,30 +116,35 @@ IMAGINARY_TOLERANCE = 1e-6
 """Imaginary part, relative to the largest frequency, that is rounding: a double zero splits by the root of rounding."""
 
 
-def _check_repeats(s: np.ndarray, lattice: Lattice, repeat: tuple[int, ...]) -> None:
+def _check_spins_repeat(spins: np.ndarray, lattice: Lattice, magnetic_cell: tuple[int, ...]) -> None:
+    """Raise InputError unless the lattice is periodic and the spins repeat after each magnetic cell."""
     if not all(lattice.periodic):
         raise InputError("waves need a lattice that is periodic along every axis")
-    for axis, m in enumerate(repeat):
-        if np.abs(np.roll(s, m, axis=axis) - s).max() > REST_TOLERANCE * np.abs(s).max():
+    for axis, m in enumerate(magnetic_cell):
+        if np.abs(np.roll(spins, m, axis=axis) - spins).max() > REST_TOLERANCE * np.abs(spins).max():
             raise InputError(
                 f"the spins do not repeat after {m} cells along axis {axis}. Give magnetic_cell= with the period"
             )
 
 
-def _cell_members(lattice: Lattice, repeat: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return sites by magnetic cell and member, shape (cells, members), those of the first cell, and offsets of cells.
+def _magnetic_cell_sites_and_offsets(
+    lattice: Lattice, magnetic_cell: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the sites of each magnetic cell, shape (cells, members), those of the first cell, and the cells' offsets.
 
     Offsets are of least length, with the signs of a periodic lattice.
     """
     atoms = len(lattice.basis)
-    axes = len(repeat)
+    axes = len(magnetic_cell)
     numbers = np.arange(lattice.site_count).reshape(*lattice.cells, atoms)
-    counts = tuple(n // m for n, m in zip(lattice.cells, repeat, strict=True))
-    split = numbers.reshape(*(length for pair in zip(counts, repeat, strict=True) for length in pair), atoms)
-    ordered = split.transpose(*range(0, 2 * axes, 2), *range(1, 2 * axes, 2), 2 * axes)
-    table = ordered.reshape(math.prod(counts), -1)
+    counts = tuple(n // m for n, m in zip(lattice.cells, magnetic_cell, strict=True))
+    split_numbers = numbers.reshape(
+        *(length for pair in zip(counts, magnetic_cell, strict=True) for length in pair), atoms
+    )
+    numbers_by_cell = split_numbers.transpose(*range(0, 2 * axes, 2), *range(1, 2 * axes, 2), 2 * axes)
+    table = numbers_by_cell.reshape(math.prod(counts), -1)
     grids = np.meshgrid(
-        *(np.rint(np.fft.fftfreq(n, 1.0 / n)) * m for n, m in zip(counts, repeat, strict=True)), indexing="ij"
+        *(np.rint(np.fft.fftfreq(n, 1.0 / n)) * m for n, m in zip(counts, magnetic_cell, strict=True)), indexing="ij"
     )
     offsets = np.stack(grids, axis=-1).reshape(-1, axes)
     return table, table[0], offsets
@@ -155,7 +160,10 @@ def _local_frames(spins: np.ndarray) -> np.ndarray:
 
 
 def _hessian_rows(energy: Energy, spins: np.ndarray, members: np.ndarray, frames: np.ndarray) -> np.ndarray:
-    """Return second derivatives along the local axes, of the members by all sites, shape (2 members, n, 2)."""
+    """Return the rows of the Hessian of an energy that belong to some spins, in local frames across the spins.
+
+    The rows are those of the members, for all n spins: shape (2 members, n, 2).
+    """
     n = len(spins)
     directions = np.zeros((2 * len(members), n, 3))
     for k, i in enumerate(members):
@@ -214,7 +222,7 @@ def spin_temperature(energy, spins, sites) -> float:
     )
     numerator, denominator = 0.0, 0.0
     for x in samples:
-        squares, laplacian = _temperature_sums(function, x, probes)
+        squares, laplacian = _squared_torques_and_laplacian(function, x, probes)
         numerator, denominator = numerator + float(squares), denominator + float(laplacian)
     if not denominator > 0.0:
         raise InputError(
@@ -225,19 +233,21 @@ def spin_temperature(energy, spins, sites) -> float:
 
 
 @eqx.filter_jit
-def _temperature_sums(energy: Energy, x, probes) -> tuple[jax.Array, jax.Array]:
-    """Return the sums of squared tangential gradients and of Laplacians on the spheres."""
+def _squared_torques_and_laplacian(energy: Energy, x, probes) -> tuple[jax.Array, jax.Array]:
+    """Return the sum of squared tangential gradients, and the sum of the Laplacians of the energy on the spheres."""
     s, g = x.reshape(-1, 3), energy.gradient(x).reshape(-1, 3)
     squares = jnp.sum(s * s, axis=1)
     radial_slopes = jnp.sum(s * g, axis=1) / squares
     tangential = g - radial_slopes[:, None] * s
 
-    def project(v):
+    def project_onto_tangent_space(v):
         v = v.reshape(-1, 3)
         return (v - (jnp.sum(v * s, axis=1) / squares)[:, None] * s).reshape(-1)
 
     def quadratic_form(v):
-        return jnp.dot(project(v), jax.jvp(energy.gradient, (x,), (project(v),))[1])
+        return jnp.dot(
+            project_onto_tangent_space(v), jax.jvp(energy.gradient, (x,), (project_onto_tangent_space(v),))[1]
+        )
 
     if probes is None:
         forms = jnp.sum(jax.lax.map(lambda i: quadratic_form(jnp.zeros_like(x).at[i].set(1.0)), jnp.arange(x.size)))

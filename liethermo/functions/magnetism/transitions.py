@@ -79,13 +79,13 @@ def binder_cumulant(magnetisation) -> Estimate:
     >>> bool(abs(found.value - 4 / 9) < 4 * found.error)
     True
     """
-    square = _checked_squares(magnetisation)
+    square = _checked_squared_magnetisation(magnetisation)
     rows = np.arange(len(square))
 
-    def cumulant(rows) -> float:
-        return _cumulant(square[rows])
+    def cumulant_of_rows(rows) -> float:
+        return _cumulant_of_squares(square[rows])
 
-    return Estimate(cumulant(rows), float(np.sqrt(_jackknife_variance(cumulant, square))))
+    return Estimate(cumulant_of_rows(rows), float(np.sqrt(_jackknife_variance(cumulant_of_rows, square))))
 
 
 def cumulant_crossing(a: MagnetSamples, b: MagnetSamples) -> Estimate:
@@ -111,24 +111,24 @@ def cumulant_crossing(a: MagnetSamples, b: MagnetSamples) -> Estimate:
     """
     if a.temperature != b.temperature:
         raise InputError(f"both lattices must have the same temperature, got {a.temperature:g} and {b.temperature:g}")
-    squares = [_checked_squares(samples.magnetisation) for samples in (a, b)]
+    squares = [_checked_squared_magnetisation(samples.magnetisation) for samples in (a, b)]
     energies = [np.asarray(samples.energy, dtype=float) for samples in (a, b)]
     for square, energy in zip(squares, energies, strict=True):
         if energy.shape != square.shape:
             raise InputError(f"energies of {len(square)} samples must have shape ({len(square)},), got {energy.shape}")
-    everything = [np.arange(len(square)) for square in squares]
+    all_rows = [np.arange(len(square)) for square in squares]
 
-    def crossing(rows: list[np.ndarray]) -> float:
-        cumulants = [_cumulant(square[r]) for square, r in zip(squares, rows, strict=True)]
+    def crossing_temperature(rows: list[np.ndarray]) -> float:
+        cumulants = [_cumulant_of_squares(square[r]) for square, r in zip(squares, rows, strict=True)]
         slopes = [
-            _cumulant_slope(square[r], energy[r], a.temperature)
+            _cumulant_temperature_derivative(square[r], energy[r], a.temperature)
             for square, energy, r in zip(squares, energies, rows, strict=True)
         ]
         return float(a.temperature - (cumulants[0] - cumulants[1]) / (slopes[0] - slopes[1]))
 
-    variance = _jackknife_variance(lambda rows: crossing([rows, everything[1]]), squares[0])
-    variance += _jackknife_variance(lambda rows: crossing([everything[0], rows]), squares[1])
-    return Estimate(crossing(everything), float(np.sqrt(variance)))
+    variance = _jackknife_variance(lambda rows: crossing_temperature([rows, all_rows[1]]), squares[0])
+    variance += _jackknife_variance(lambda rows: crossing_temperature([all_rows[0], rows]), squares[1])
+    return Estimate(crossing_temperature(all_rows), float(np.sqrt(variance)))
 
 
 def autocorrelation_time(values) -> float:
@@ -147,7 +147,8 @@ def autocorrelation_time(values) -> float:
     return float(total)
 
 
-def _checked_squares(magnetisation) -> np.ndarray:
+def _checked_squared_magnetisation(magnetisation) -> np.ndarray:
+    """Return ``m^2`` of each sample, shape (n,); raise InputError unless the samples have shape (n, 3)."""
     m = np.asarray(magnetisation, dtype=float)
     if m.ndim != 2 or m.shape[1] != 3 or len(m) < MIN_BLOCKS or not np.isfinite(m).all():
         raise InputError(
@@ -156,15 +157,18 @@ def _checked_squares(magnetisation) -> np.ndarray:
     return (m**2).sum(axis=1)
 
 
-def _cumulant(square) -> float:
-    return float(1.0 - (square**2).mean() / (3.0 * square.mean() ** 2))
+def _cumulant_of_squares(squared_magnetisation) -> float:
+    """Return Binder's cumulant ``1 - <m^4> / 3 <m^2>^2`` from samples of ``m^2``."""
+    return float(1.0 - (squared_magnetisation**2).mean() / (3.0 * squared_magnetisation.mean() ** 2))
 
 
-def _cumulant_slope(square, energy, temperature: float) -> float:
-    """Return the derivative of the cumulant by k T."""
-    second, fourth = square.mean(), (square**2).mean()
-    changes = [((x - x.mean()) * energy).mean() / temperature**2 for x in (square, square**2)]
-    return float((2.0 * fourth * changes[0] / second - changes[1]) / (3.0 * second**2))
+def _cumulant_temperature_derivative(squared_magnetisation, energy, temperature: float) -> float:
+    """Return the derivative of Binder's cumulant by the temperature k T, from fluctuations of the energy."""
+    second_moment, fourth_moment = squared_magnetisation.mean(), (squared_magnetisation**2).mean()
+    changes = [
+        ((x - x.mean()) * energy).mean() / temperature**2 for x in (squared_magnetisation, squared_magnetisation**2)
+    ]
+    return float((2.0 * fourth_moment * changes[0] / second_moment - changes[1]) / (3.0 * second_moment**2))
 
 
 def _jackknife_variance(quantity: Callable, series: np.ndarray) -> float:

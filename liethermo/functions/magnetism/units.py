@@ -104,7 +104,7 @@ class Units(NamedTuple):
         -------
         SpinDynamics
         """
-        alpha, ratio = _checked_damping(alpha), self._ratio(moment, g)
+        alpha, ratio = _checked_damping(alpha), self._gyromagnetic_ratio(moment, g)
         return SpinDynamics(ratio / (1.0 + alpha**2), alpha * ratio / (1.0 + alpha**2))
 
     def landau_lifshitz(self, alpha, moment=None, g: float = ELECTRON_G_FACTOR) -> SpinDynamics:
@@ -121,16 +121,18 @@ class Units(NamedTuple):
         -------
         SpinDynamics
         """
-        alpha, ratio = _checked_damping(alpha), self._ratio(moment, g)
+        alpha, ratio = _checked_damping(alpha), self._gyromagnetic_ratio(moment, g)
         return SpinDynamics(ratio, alpha * ratio)
 
-    def _ratio(self, moment, g: float):
+    def _gyromagnetic_ratio(self, moment, g: float):
+        """Return ``gamma / mu`` for spins of this moment, by default one Bohr magneton."""
         mu = self.moment() if moment is None else checked_numbers(moment, "a moment")
         require_condition(mu, lambda m: m > 0.0, "a moment must be positive, got {value}")
         return self.gamma(g) / mu
 
 
 def _checked_damping(alpha):
+    """Return a damping constant; raise InputError if it is negative."""
     alpha = checked_numbers(alpha, "alpha")
     require_condition(alpha, lambda a: a >= 0.0, "alpha must be >= 0, got {value}")
     return alpha
@@ -185,4 +187,4 @@ def units(name: str = "meV") -> Units:
         )
     if name == "reduced":
         return Units("reduced", "energy", "time", "length", 1.0, 1.0, 1.0, 1.0)
-    raise InputError(f'the units of magnets are "SI", "meV" or "reduced", got {name!r}')
+    raise InputError(f'the units of magnets must be "SI", "meV" or "reduced", got {name!r}')

@@ -9,6 +9,7 @@ import numpy as np
 from manifolds.matrices.linear import inverse
 
 from ...systems import ComposedSystem, System
+from ...systems.kinds import require_kind
 from ..base import MethodWrapper
 from .discrete import FiniteDifference
 
@@ -39,7 +40,7 @@ class ComposedVariational(MethodWrapper):
         return str(self.method)
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
-        assert isinstance(system, ComposedSystem)
+        system = require_kind(system, ComposedSystem, str(self))
         maps = self.maps
         if len(maps) == 1:
             return system.vector_field(x + (compensation + h * component_evaluation_fractions(system, maps[0]) * k[0]))[

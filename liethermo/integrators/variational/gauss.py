@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from manifolds.matrices.linear import solve
 
-from ...systems import SimpleClosedSystem, System
+from ...systems import System
 from ..base import WHY_FIXED_VARIATIONAL_STEP, GaussMethod, checked_stages, register
 from ..tableaus import gauss_tableau
 from .equations import velocity_slope
@@ -58,7 +58,7 @@ class VariationalGauss(GaussMethod):
         require_simple_closed(system, "VariationalGauss")
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
-        assert isinstance(system, SimpleClosedSystem)
+        system = require_simple_closed(system, "VariationalGauss")
         (A, b, c), n, start = gauss_tableau(self.number), system.degrees_of_freedom, x + compensation
         (q0, v0, S0, t0), V, s = system.split_state(start), k[:, :n], k[:, 2 * n]
         q, S, t, p0 = q0 + h * (A @ V), S0 + h * (A @ s), t0 + h * c, system.momentum(q0, v0, S0)

@@ -19,13 +19,13 @@ from ...errors import InputError
 from ...functions.conditions import require_condition
 from ...functions.newton import newton_correction, newton_iterate
 from ...systems import EulerPoincareClosedSystem, System
+from ...systems.kinds import require_kind
 from ...tracing.programs import jit_cached
 from ..base import (
     WHY_FIXED_VARIATIONAL_STEP,
     OneStepMethod,
     checked_run_states,
     checked_step_size,
-    kind_or_class_name,
     register,
 )
 
@@ -81,11 +81,7 @@ class LieVariational(OneStepMethod):
 
     def check(self, system: System) -> None:
         """Raise InputError if the system has the wrong kind, or its algebra has no group by the Cayley map."""
-        if not isinstance(system, EulerPoincareClosedSystem):
-            raise InputError(
-                f"LieVariational needs an lt.EulerPoincareClosedSystem, got a {kind_or_class_name(system)}"
-            )
-        algebra = system.algebra
+        algebra = require_kind(system, EulerPoincareClosedSystem, "LieVariational").algebra
         if self.tau == "exp":
             return
         if algebra.basis is None:
@@ -103,12 +99,12 @@ class LieVariational(OneStepMethod):
             ) from error
 
     def start(self, system: System, x) -> jax.Array:
-        assert isinstance(system, EulerPoincareClosedSystem)
+        system = require_kind(system, EulerPoincareClosedSystem, "LieVariational")
         n = system.algebra.dim
         return jnp.stack([system.vector_field(x), jnp.zeros_like(x).at[:n].set(x[:n])])
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
-        assert isinstance(system, EulerPoincareClosedSystem)
+        system = require_kind(system, EulerPoincareClosedSystem, "LieVariational")
         n = system.algebra.dim
         xi0, S0, t = system.split_state(x + compensation)
         step = _LieStep(system, self.tau, S0, h, t)

@@ -16,6 +16,7 @@ import manifolds as mf
 from ...errors import InputError
 from ...functions.conditions import checked_numbers
 from ...systems import ComposedSystem, EmbeddedSystem, SimpleClosedSystem, System
+from ...systems.kinds import require_kind, user_system
 from ...tracing.programs import jit_cached
 from ..base import (
     WHY_FIXED_VARIATIONAL_STEP,
@@ -23,7 +24,6 @@ from ..base import (
     apply_increment,
     checked_run_states,
     checked_step_size,
-    kind_or_class_name,
     register,
 )
 from ..charts import resolve_retraction
@@ -156,23 +156,24 @@ class VariationalIntegrator(OneStepMethod):
 
     def check(self, system: System) -> None:
         """Raise InputError unless the system is simple closed or composed, and the maps suit it."""
-        if isinstance(system, EmbeddedSystem) and isinstance(system.manifold, SimpleClosedSystem):
+        closed = _simple_closed_or_none(user_system(system))
+        if closed is not None and system.surface is not None:
             if any(type(map) is not FiniteDifference for map in (*self.phi, *self.forces, *self.constraint)):
                 raise InputError(
                     "on a manifold the maps must be lt.FiniteDifference itself, no subclass: they are evaluated on a "
                     "curve of the space, which retraction= determines"
                 )
-            self.curve(system.manifold)
+            self.curve(closed)
         elif self.retraction is not None:
             raise InputError(
                 f"retraction= needs a manifold of positions, and this {system.kind} has none. Leave retraction= out"
             )
-        elif isinstance(system, ComposedSystem):
-            self._check_maps_for_bodies(system)
+        elif (composed := _composed_or_none(system)) is not None:
+            self._check_maps_for_composed_system(composed)
         else:
             require_simple_closed(system, "VariationalIntegrator")
 
-    def _check_maps_for_bodies(self, system: ComposedSystem) -> None:
+    def _check_maps_for_composed_system(self, system: ComposedSystem) -> None:
         if not (self.phi == self.forces == self.constraint):
             raise InputError(f"for several bodies the maps of forces and constraint must be phi, and {self} has others")
         if any(type(map) is not FiniteDifference for map in self.phi):
@@ -187,11 +188,8 @@ class VariationalIntegrator(OneStepMethod):
             )
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
-        return (
-            ComposedVariational(self, self.phi)
-            if isinstance(system, ComposedSystem) and self.retraction is None
-            else self
-        )
+        is_for_bodies = _composed_or_none(system) is not None and self.retraction is None
+        return ComposedVariational(self, self.phi) if is_for_bodies else self
 
     def discrete_system(self, system: SimpleClosedSystem, h, t=0.0) -> DiscreteSystem:
         """Return the discrete system of a step of size h from the time t: its Lagrangian, forces and constraint."""
@@ -208,8 +206,7 @@ class VariationalIntegrator(OneStepMethod):
     # -- the step ---------------------------------------------------------------------------------------------------
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
-        system = system.manifold if isinstance(system, EmbeddedSystem) else system
-        assert isinstance(system, SimpleClosedSystem)
+        system = require_kind(user_system(system), SimpleClosedSystem, "VariationalIntegrator")
         n = system.degrees_of_freedom
         q0, v0, S0, t = system.split_state(x + compensation)
         discrete, p0 = self.discrete_system(system, h, t), system.momentum(q0, v0, S0)
@@ -293,13 +290,15 @@ class VariationalIntegrator(OneStepMethod):
         -------
         ndarray, shape (times - 1,)
         """
-        require_simple_closed(system, "VariationalIntegrator")
+        system = require_simple_closed(system, "VariationalIntegrator")
         x = checked_run_states(system, x)
         return np.asarray(_step_energies(self, system, checked_step_size(h), x[:-1], x[1:]))
 
     def why_step_failed(self, system: System, x, k, h) -> str:
-        if not isinstance(system, SimpleClosedSystem) or system.configurations is not None:
+        closed = _simple_closed_or_none(system)
+        if closed is None or closed.configurations is not None:
             return ""
+        system = closed
         n = system.degrees_of_freedom
         q0, _, S0, t = system.split_state(jnp.asarray(x))
         slope = jnp.nan_to_num(jnp.asarray(k)[0])
@@ -341,14 +340,21 @@ SYMMETRIC_RETRACTION_TYPES = (
 """Classes of retractions whose line through two points is the same in the charts around both."""
 
 
-def require_simple_closed(system: System, method_name: str) -> None:
-    """Raise InputError, with the name of the method, unless the system is simple closed and on R^n."""
+def _simple_closed_or_none(system: System) -> SimpleClosedSystem | None:
+    return system if isinstance(system, SimpleClosedSystem) else None
+
+
+def _composed_or_none(system: System) -> ComposedSystem | None:
+    return system if isinstance(system, ComposedSystem) else None
+
+
+def require_simple_closed(system: System, method_name: str) -> SimpleClosedSystem:
+    """Return the system if it is a simple closed system on R^n; otherwise raise InputError with the method's name."""
     if isinstance(system, EmbeddedSystem):
         raise InputError(
             f"{method_name} runs only on R^n. On a manifold use lt.VariationalIntegrator or a metriplectic method"
         )
-    if not isinstance(system, SimpleClosedSystem):
-        raise InputError(f"{method_name} needs an lt.SimpleClosedSystem, got a {kind_or_class_name(system)}")
+    return require_kind(system, SimpleClosedSystem, method_name)
 
 
 SCHEMES: dict[str, tuple[FiniteDifference, ...]] = {

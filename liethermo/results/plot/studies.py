@@ -75,7 +75,7 @@ def study(
     if len(axes) not in (1, 2) or len(extra_dims) > (0 if is_sample or len(axes) == 2 else 1):
         dims = ", ".join(f"{dim} ({dataset.sizes[dim]})" for dim in (*axes, *extra_dims))
         raise InputError(
-            f"a picture has one or two axes, but {values.name} has {dims}. Choose points with results.isel(...)"
+            f"a picture must have one or two axes, but {values.name} has {dims}. Choose points with results.isel(...)"
         )
     if ax is None:
         _, ax = plt.subplots(figsize=(6.4, 4.4), dpi=DPI, layout="constrained")

@@ -24,6 +24,7 @@ from scipy.ndimage import map_coordinates
 from ...errors import InputError
 from ...systems import QuantumSystem, System
 from ...systems.invariants import recorded_functions_with_verdicts
+from ...systems.kinds import require_kind
 from ..solution import Solution
 from .figures import BLUE, DPI, GREY, ORANGE, RED, checked_figure_path, save_figure
 
@@ -466,8 +467,7 @@ def bloch_ball(
         If the file cannot be written.
     """
     path = checked_figure_path(path)
-    if not isinstance(system, QuantumSystem):
-        raise InputError(f"a Bloch ball shows states of an lt.QuantumSystem, not of a {type(system).__name__}")
+    require_kind(system, QuantumSystem, "a Bloch ball")
     vectors = np.asarray(system.bloch(states.x if isinstance(states, Solution) else states, part))
     if ax is None:
         ax = plt.figure(figsize=(4.6, 4.6), dpi=DPI, layout="constrained").add_subplot(projection="3d")

@@ -70,7 +70,7 @@ def read_graph(path: str | os.PathLike, weight: str = "conductance", nodes: Sequ
         raise FileError(f"there is no file {path}")
     readers = {".csv": _read_csv, ".graphml": _read_graphml}
     if path.suffix.lower() not in readers:
-        raise FileError(f"{path} is neither .csv nor .graphml, the kinds of graph that can be read")
+        raise FileError(f"a file of a graph must be .csv or .graphml, got {path}")
     file_names, edges = readers[path.suffix.lower()](path, weight)
     names = _node_names(file_names, nodes, path)
     index = {name: i for i, name in enumerate(names)}

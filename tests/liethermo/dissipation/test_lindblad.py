@@ -66,6 +66,7 @@ def test_the_motion_is_that_of_the_exponential_of_its_superoperator():
     audit = run.audit()
     assert audit.passed
     assert str(audit).count("no law promised") == 2
+    assert audit.verdict.startswith("the promised laws hold, and the steps resolve the motion")
     assert abs(np.trace(system.density(run.x[-1])) - 1.0) < 1e-14
 
 

@@ -11,7 +11,7 @@ from liethermo.engines.compiled.llvm_writer import ProgramWriter
 from liethermo.engines.select_engine import CompiledEngineWarning
 from liethermo.runs import problem
 from liethermo.tracing import scalarize
-from liethermo.tracing.builder import Builder
+from liethermo.tracing.builder import ProgramBuilder
 from liethermo.tracing.primitives import UNROLLING_RULES
 
 X0 = np.array([0.4, 0.5, -0.3])
@@ -74,7 +74,7 @@ def raising(*arguments, **keywords):
 FAULTS = {
     "rule of a primitive": lambda patch: patch.setitem(UNROLLING_RULES, "sin", raising),
     "scalar compiler": lambda patch: patch.setattr(scalarize, "_collect_program", raising),
-    "builder": lambda patch: patch.setattr(Builder, "mul", raising),
+    "builder": lambda patch: patch.setattr(ProgramBuilder, "mul", raising),
     "writer": lambda patch: patch.setattr(ProgramWriter, "write_operation", raising),
     "LLVM": lambda patch: patch.setattr("liethermo.engines.compiled.loop_codegen.MachineCode", raising),
 }

@@ -12,7 +12,14 @@ import manifolds as mf
 from liethermo.dissipation.base import Dissipation
 from liethermo.engines import array_engine
 from liethermo.engines.solver_options import DEFAULT_OPTIONS
-from liethermo.engines.stage_solver import IterationState, StageEquations, solve_krylov, solve_newton, solve_stages
+from liethermo.engines.stage_solver import (
+    IterationState,
+    StageEquations,
+    solve_fixed_point,
+    solve_krylov,
+    solve_newton,
+    solve_stages,
+)
 from liethermo.engines.step import initial_run_state_program
 from liethermo.runs.preparation import checked_initial_state, prepare_system_and_method
 
@@ -92,6 +99,23 @@ def test_an_iteration_is_slow_by_its_last_update_and_by_the_last_two():
         True,
     ]  # two components that do not converge
     assert slowness_by_update([1.0, 2.0, 4.0, 8.0], 0.6)[1:] == [True] * 3
+
+
+@pytest.mark.parametrize("growth", [0.97, 1.0, 1.2])
+def test_an_iteration_that_starts_below_its_limit_and_does_not_shrink_has_not_converged(growth):
+    """A stiff system at rest: updates of 5e-14 of the state stall, but are no rounding."""
+    turn = growth * np.array([[np.cos(2.0), -np.sin(2.0)], [np.sin(2.0), np.cos(2.0)]])
+    guess = jnp.array([[5e-14, 0.0]])
+    equations = StageEquations(lambda k: k @ turn, guess, lambda k: 1.0, lambda k: lambda r: r @ inverse_of(turn))
+    assert not bool(solve_fixed_point(equations).converged)
+    solution = solve_stages(equations)
+    assert bool(solution.converged)
+    assert np.abs(solution.k).max() <= 1e-20
+
+
+def inverse_of(turn):
+    """Return the inverse of the Jacobian of ``slopes(k) - k``, for rows k."""
+    return np.linalg.inv(turn - np.eye(2))
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.functions.conditions import collect_conditions, refusal_message, require_condition
+from liethermo.functions.conditions import collect_conditions, condition_message, require_condition
 from liethermo.functions.energy import MIN_BUFFERED_DIM, make_energy
 from liethermo.functions.rounding import propagated_rounding_scale, value_and_rounding_scale
 
@@ -39,7 +39,9 @@ def failed_messages(build, *arguments):
 
     results = jax.jit(conditions)(*map(jnp.asarray, arguments))
     return [
-        refusal_message(message, value) for message, (holds, value) in zip(messages, results, strict=True) if not holds
+        condition_message(message, value)
+        for message, (holds, value) in zip(messages, results, strict=True)
+        if not holds
     ]
 
 

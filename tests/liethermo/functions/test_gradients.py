@@ -15,7 +15,7 @@ from liethermo.functions.gradients import (
     CorrectionDirection,
     FunctionChange,
     correct_gradients,
-    stage_gradients,
+    discrete_gradients_at_stages,
 )
 from liethermo.integrators.tableaus import gauss_tableau, kronrod_rule
 from tests.cases import EPS, energy_of
@@ -222,7 +222,7 @@ def test_derivatives_at_stages_of_a_step_that_vanishes(stages, length):
     @jax.jit
     @jax.jacfwd
     def stage_jacobian(k):
-        return stage_gradients(energy, x, jnp.zeros(2), h, k, A, b, kronrod_rule(stages))
+        return discrete_gradients_at_stages(energy, x, jnp.zeros(2), h, k, A, b, kronrod_rule(stages))
 
     expected = np.einsum("ij,ab->iajb", h * A, np.diag([-1.0, -0.5]))
     np.testing.assert_allclose(stage_jacobian(jnp.full((stages, 2), length)), expected, atol=1e-15)
@@ -236,7 +236,7 @@ def test_a_defect_below_its_noise_is_corrected_where_the_gradient_varies(variati
     quadrature = h * jnp.dot(b, jnp.sum(gradients * k, axis=1))
     change = FunctionChange(quadrature + 1e-15, jnp.asarray(1e-14), gradients)
     corrected = correct_gradients(
-        change, gradients, k, CorrectionDirection.of(k, b), h, b, gradient_variation=variation
+        change, gradients, k, CorrectionDirection.from_slopes(k, b), h, b, gradient_variation=variation
     )
     correction = float(h * jnp.dot(b, jnp.sum((corrected - gradients) * k, axis=1)))
     assert correction == pytest.approx(1e-15 if is_corrected else 0.0, abs=3e-16)

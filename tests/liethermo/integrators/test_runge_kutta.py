@@ -13,7 +13,7 @@ from liethermo.integrators.tableaus import (
     LOBATTO_ORDERS,
     ErrorEstimate,
     ExplicitTableau,
-    lobatto_tableau,
+    explicit_lobatto_tableau,
     rooted_tree_vectors,
 )
 from tests.liethermo.integrators.test_orders import NONLINEAR
@@ -64,7 +64,7 @@ def tree_vector_and_density(A, tree):
 @pytest.mark.parametrize(("order", "stages"), [(4, 4), (6, 7), (8, 11)])
 def test_order_conditions(order, stages):
     """All rooted trees meet the conditions [Hairer, Nørsett & Wanner 1993, II.2]; error weights vanish up to q."""
-    tableau = lobatto_tableau(order)
+    tableau = explicit_lobatto_tableau(order)
     A, b, estimate, quadrature_estimate = tableau
     counts = [1, 1, 2, 4, 9, 20, 48, 115, 286]
     trees = rooted_trees(order)
@@ -86,7 +86,7 @@ def test_order_conditions(order, stages):
 @pytest.mark.parametrize("order", LOBATTO_ORDERS)
 def test_error_estimates_are_right_for_a_linear_equation_and_a_quadrature(order):
     """The local errors of x' = x and x' = exp(t), by the tableau in plain numbers, as h -> 0."""
-    A, b, estimate, quadrature_estimate = lobatto_tableau(order)
+    A, b, estimate, quadrature_estimate = explicit_lobatto_tableau(order)
     h = 0.5  # errors of order 8 are rounding for shorter steps
     linear, quadrature = np.linalg.solve(np.eye(len(b)) - h * A, np.ones(len(b))), np.exp(h * A.sum(axis=1))
     for slopes, (d, q, scale) in ((linear, estimate), (quadrature, quadrature_estimate or estimate)):

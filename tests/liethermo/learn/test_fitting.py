@@ -165,7 +165,7 @@ X = np.arange(15.0).reshape(5, 3)
     ("data", "how", "words"),
     [
         ((T, np.where(np.arange(15).reshape(5, 3) == 7, np.inf, X)), {}, "component 1 of state 2 is inf"),
-        ((T[:1], X[:1]), {}, "1 point: at least 2"),
+        ((T[:1], X[:1]), {}, "has 1 time, at least 2 are needed"),
         ((T[[0, 2, 1, 3, 4]], X), {}, "times must grow, but time 2 is 0.25 after 0.5"),
         ((T, X[:4]), {}, "5 times and 4 states"),
         ((T, X[:, :2]), {}, "shape"),

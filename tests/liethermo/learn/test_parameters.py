@@ -363,7 +363,7 @@ BAD = {
     ),
     "unsorted": (lambda: fit_spring((TIMES[::-1], spring_record())), "Sort the rows by time"),
     "all missing": (lambda: fit_spring((TIMES, np.nan * TIMES)), "has no values, only NaN"),
-    "one time": (lambda: fit_spring((TIMES[:1], spring_record()[:1])), "1 point: at least 2"),
+    "one time": (lambda: fit_spring((TIMES[:1], spring_record()[:1])), "has 1 time, at least 2 are needed"),
     "one value": (
         lambda: fit_spring((TIMES, np.where(TIMES == 0.0, 1.0, np.nan))),
         "has 1 time with values, at least 2 are needed",

@@ -137,7 +137,10 @@ BAD = {
     "repeated": (lambda: lt.learn.read_data(table(t=T[[0, 1, 1, 3]])), "time 0.01 occurs twice. Keep one of these"),
     "unknown column": (lambda: lt.learn.read_data(table(), ["y"]), "no column 'y'; their columns are t, x"),
     "unknown time": (lambda: lt.learn.read_data(table(), time="s"), "no column 's'; their columns are t, x"),
-    "no time": (lambda: lt.learn.read_data({"x": T}), "no column 'time'; their columns are x. Name the times"),
+    "no time": (
+        lambda: lt.learn.read_data({"x": T}),
+        "no column 'time'; their columns are x. Name the column of the times",
+    ),
     "two times": (lambda: lt.learn.read_data(table(time=T)), "the columns t, time may all be times"),
     "all missing": (lambda: lt.learn.read_data(table(x=np.nan * T)), "column 'x' has no values, only missing ones"),
     "one row": (lambda: lt.learn.read_data({"t": [1.0], "x": [2.0]}), "1 row with values, at least 2 are needed"),

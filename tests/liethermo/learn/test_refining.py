@@ -214,7 +214,7 @@ def test_fits_to_few_trajectories_spread_as_their_errors(number):
 def test_fits_that_are_all_equal_say_nothing():
     data = [(TIMES, run(STARTS[0], RATE))]
     fits = lt.learn.several(lambda seed: spring(0.5), data, 2, positive=rate_of, validation=0, **SHORT_FIT)
-    with pytest.warns(lt.learn.FitWarning, match=r"equal in all fits, so its deviation of 0 is no error"):
+    with pytest.warns(lt.learn.FitWarning, match=r"equal in all fits, so its deviation of 0 is not an error"):
         fits.spread(lambda s: s.energy.value(jnp.zeros(3)))
 
 

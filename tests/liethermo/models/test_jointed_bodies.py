@@ -353,6 +353,38 @@ def test_joints_without_axes_or_with_negative_damping(make_joint, match):
         make_joint()
 
 
+def test_states_in_degrees_and_by_temperature(system, x0):
+    degrees = {name: np.degrees(value) for name, value in JOINTS.items()} | {"tank": JOINTS["tank"]}  # the tank slides
+    rates = {name: np.degrees(value) for name, value in RATES.items()} | {"tank": RATES["tank"]}
+    same = system.state(
+        angular_velocity=np.degrees(ANGULAR_VELOCITY),
+        joints=degrees,
+        joint_rates=rates,
+        temperature=310.0,
+        degrees=True,
+    )
+    np.testing.assert_allclose(same[:-1], x0[:-1], rtol=1e-13, atol=1e-15)
+    assert float(system.temperature(same)) == pytest.approx(310.0, rel=1e-13)
+    many = system.state(angular_velocity=[ANGULAR_VELOCITY] * 2, joints=JOINTS, joint_rates=RATES, temperature=310.0)
+    np.testing.assert_allclose(many[1], same, rtol=1e-13, atol=1e-15)
+    with pytest.raises(lt.InputError, match="not both"):
+        system.state(x0, degrees=True)
+    with pytest.raises(lt.InputError, match=r"baths=lt.HeatBaths"):
+        tree_of(BODIES, NAMES).system().state(temperature=310.0)
+
+
+def test_states_on_the_ground_in_degrees_and_by_temperature():
+    tree = lt.bodies.Tree(ground="ceiling")
+    hinge = lt.bodies.Hinge(at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0), damping=0.1)
+    tree.add("bob", mass=1.0, centre=(0.0, 0.0, -0.5), parent="ceiling", joint=hinge)
+    pendulum = tree.system(gravity=(0.0, 0.0, -9.81), baths=BATHS)
+    x0 = pendulum.state(joints={"bob": 30.0}, joint_rates={"bob": 90.0}, temperature=290.0, degrees=True)
+    np.testing.assert_allclose(x0[:2], [np.pi / 6, 0.25 * np.pi / 2], rtol=1e-14)  # m l^2 = 0.25
+    assert float(pendulum.temperature(x0)) == pytest.approx(290.0, rel=1e-13)
+    with pytest.raises(lt.InputError, match="not both"):
+        pendulum.state(x0, temperature=290.0)
+
+
 def test_other_bad_input(system):
     with pytest.raises(lt.InputError, match="'antenna'"):
         system.state(joints={"antenna": 0.1})

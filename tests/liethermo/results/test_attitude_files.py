@@ -38,6 +38,20 @@ def test_what_is_written_is_read_back(run, tmp_path, degrees, scalar):
     assert np.abs(rest.attitude[-1] - run.attitude[-1]).max() < 1e-13
 
 
+@pytest.mark.parametrize("degrees", [False, True])
+def test_euler_angles_are_further_columns(run, tmp_path, degrees):
+    path = lt.bodies.write_csv(tmp_path / "run.csv", run, degrees=degrees, euler="ZYX")
+    unit = "deg" if degrees else "rad"
+    names = path.read_text().splitlines()[0].split(",")
+    assert names[-3:] == [f"euler_ZYX_{i} [{unit}]" for i in (1, 2, 3)]
+    angles = np.loadtxt(path, delimiter=",", skiprows=1)[:, -3:]
+    expected = Rotation.from_matrix(run.attitude).as_euler("ZYX", degrees=degrees)
+    assert np.abs(angles - expected).max() < 1e-13
+    assert np.abs(lt.bodies.read_csv(path).attitude - run.attitude).max() < 2e-15
+    with pytest.raises(lt.InputError, match="three"):
+        lt.bodies.write_csv(path, run, euler="ZY")
+
+
 def test_columns_are_found_by_their_names(tmp_path):
     path = tmp_path / "other.csv"
     path.write_text("mode, q_w ,q_x,q_y,q_z,t [s]\n3,0.7071,0,0,0.7071,10.5\n3,1,0,0,0,11\n")

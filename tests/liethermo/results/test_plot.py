@@ -335,7 +335,7 @@ def test_bloch_ball_of_a_run_and_of_states(tmp_path):
     path = tmp_path / "ball.png"
     lt.plot.bloch_ball(np.stack([run.x, run.x]), qubit, path=path)  # several trajectories
     assert path.stat().st_size > 10_000
-    with pytest.raises(lt.InputError, match=r"shows states of an lt\.QuantumSystem"):
+    with pytest.raises(lt.InputError, match=r"a Bloch ball needs an lt\.QuantumSystem"):
         lt.plot.bloch_ball(run, lt.models.rigid_body())
     with pytest.raises(lt.InputError, match='projection="3d"'):
         lt.plot.bloch_ball(run, qubit, ax=plt.figure().add_subplot())

@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 import liethermo as lt
 import manifolds as mf
 from liethermo.runs.time_features import UndeclaredFeatureWarning
+from tests.refusals import refusal_test
 
 INERTIA = np.array([1.0, 2.0, 3.0])
 
@@ -431,3 +432,21 @@ def test_tables_in_ensembles(reference_with_table):
     table_times = np.stack([KNOTS, KNOTS + 0.2])  # no common times at which steps could end
     many_times = lt.ensemble(body, X0, (0.0, END), 0.01, method, parameters={"torque.times": table_times})
     assert np.abs(many_times.x[0] - reference_with_table).max() < 1e-4
+
+
+def test_pulses_that_overlap_are_added():
+    starts, ends = [2.0, 5.0, 5.4, 9.0, 9.0], [2.6, 5.8, 6.0, 9.2, 9.25]
+    heights = np.random.default_rng(2).standard_normal((5, 3))
+    pulses = lt.PiecewiseConstant.from_pulses(starts, ends, heights)
+    assert pulses.times == tuple(sorted({*starts, *ends}))
+    for t in np.linspace(1.03, 10.03, 50):
+        expected = sum(h for a, b, h in zip(starts, ends, heights, strict=True) if a <= t < b) + np.zeros(3)
+        np.testing.assert_allclose(pulses(t), expected, atol=1e-15)
+
+
+test_a_piecewise_constant_function_that_is_refused = refusal_test(
+    (lambda: lt.PiecewiseConstant([1.0, 2.0, 3.0], [1.0, 0.0, 2.0]), "with 3 times needs 2 values, .* shape \\(3,\\)"),
+    (lambda: lt.PiecewiseConstant([1.0, 1.0, 3.0], [1.0, 0.0]), "must increase"),
+    (lambda: lt.PiecewiseConstant.from_pulses([1.0], [1.0], [1.0]), "must end after its start"),
+    (lambda: lt.PiecewiseConstant.from_pulses([1.0], [2.0, 3.0], [1.0]), "one start, one end and one value"),
+)

@@ -127,6 +127,43 @@ def test_parameters_of_a_call():
         propagator.final(MU, SPAN, parameters={"dissipation.rate": [0.7, 0.1]})
 
 
+BATHS_OF_TWO_KINDS = lt.HeatBaths([1.0, 2.0], [1.0, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("name", "invalid", "valid", "message"),
+    [
+        ("dissipation.rate", -1.0, 0.3, r"a dissipation rate must be >= 0, got -1"),
+        ("dissipation.rate", np.nan, 0.3, r"a dissipation rate must be >= 0, got nan"),
+        ("baths.capacity", [1.0, -2.0], [0.5, 2.0], r"the capacity of a bath must be positive, got \[1\.0, -2\.0\]"),
+        ("baths.temperature", [0.0, 1.0], [0.5, 2.0], r"the temperature of a bath must be positive"),
+    ],
+)
+def test_new_values_meet_the_conditions_of_the_constructors(name, invalid, valid, message):
+    """A negative rate made the entropy fall, silently: machine code takes new values without a new system."""
+    system = lt.LiePoissonSystem(
+        mf.so(3),
+        lambda m: m @ (m * np.array([1.0, 2.0, 3.0])),
+        dissipation=lt.DoubleBracket(0.1),
+        baths=BATHS_OF_TWO_KINDS,
+    )
+    p, x0 = lt.Propagator(system, None, STEP), [*MU, 0.0, 0.0]
+    calls = [
+        lambda value: p.final(x0, SPAN, parameters={name: value}),
+        lambda value: p(x0, SPAN, parameters={name: value}).x[-1],
+        lambda value: lt.flow(system, x0, SPAN, STEP, parameters={name: value}),
+    ]
+    for call in calls:
+        before = call(valid)
+        with pytest.raises(lt.InputError, match=message):
+            call(invalid)
+        assert np.array_equal(call(valid), before)
+    if not np.isnan(invalid).any():  # an ensemble runs the other members
+        many = p.many(x0, SPAN, parameters={name: np.array([valid, invalid, valid])})
+        assert many.status.tolist()[0] == many.status.tolist()[2] == 0 != many.status.tolist()[1]
+        assert np.array_equal(many.x[0], calls[1](valid))
+
+
 def test_what_is_conserved_belongs_to_the_parameters_of_the_call():
     """An isotropic body conserves more than others: its neighbours in a loop over parameters must not."""
     energy = lt.Quadratic([1.0, 1.0, 1.0])

@@ -211,6 +211,8 @@ def test_values_that_cannot_be_used_are_refused_as_before():
         with pytest.raises(lt.InputError, match=r"dissipation\.rate must have shape \(\), got \(2,\)"):
             propagator.final(MU, SPAN, parameters={"dissipation.rate": [0.7, 0.1]})
         with pytest.raises(lt.NonFiniteError, match="NaN or infinity"):
+            propagator.final(MU, SPAN, parameters={"energy.inertia": [np.nan, 2.0, 1.0]})
+        with pytest.raises(lt.InputError, match="a dissipation rate must be >= 0, got nan"):
             propagator.final(MU, SPAN, parameters={"dissipation.rate": np.nan})
         with pytest.raises(lt.InputError, match="a state of this system must have shape"):
             propagator.final(MU[:2], SPAN, parameters={"dissipation.rate": 0.4})

@@ -174,6 +174,20 @@ def test_the_number_of_baths_is_that_of_their_entries():
     assert lt.HeatBaths(3.0, 2.0).number == lt.HeatBaths().number == 1
 
 
+def test_a_system_without_baths_has_baths_of_number_zero():
+    """Its baths may be given to another system, which has none either."""
+    zeeman = lt.magnetism.zeeman(1, (0.0, 0.0, FIELD))
+    system = lt.SpinSystem(1, zeeman, lt.LandauLifshitz(RATE))
+    again = lt.SpinSystem(1, zeeman, lt.LandauLifshitz(RATE), baths=system.baths)
+    assert system.baths.number == again.baths.number == 0
+    assert system.dim == system.body_dim == again.dim == 3
+    assert repr(again) == repr(system)
+    assert np.array_equal(system.samples(2), again.samples(2))
+    assert spin_in_a_bath(1.0).drop_baths().baths.number == 0
+    with pytest.raises(lt.InputError, match=r"no baths\. Give it baths="):
+        system.temperatures(START)
+
+
 BAD = {
     "a finite capacity": (lambda: lt.HeatBaths(2.0, lambda t: 1.0 + t), "must be infinite"),
     "a vector of temperatures": (lambda: lt.HeatBaths(np.inf, lambda t: jnp.ones(2)), "must have shape"),
@@ -195,3 +209,30 @@ BAD = {
 
 
 test_bad_baths_are_refused = refusal_test(BAD, error=(lt.InputError, lt.FunctionError))
+
+
+def test_one_temperature_has_no_axis_and_several_have_one():
+    one, two = (lt.HeatBaths(capacity=2.0, temperature=temperatures) for temperatures in (3.0, [3.0, 4.0]))
+
+    def spin(baths):
+        return lt.SpinSystem(1, lt.magnetism.zeeman(1, (0, 0, 1.0)), lt.LandauLifshitz(0.1), baths)
+
+    x = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 1.0, 2.0 * np.log(2.0)]])
+    np.testing.assert_allclose(spin(one).temperature(x), [3.0, 6.0], rtol=1e-14)
+    np.testing.assert_allclose(spin(one).temperatures(x), [[3.0], [6.0]], rtol=1e-14)
+    with pytest.raises(lt.InputError, match=r"2 temperatures. Use system.temperatures\(x\), of shape \(..., 2\)"):
+        spin(two).temperature(np.zeros(5))
+    with pytest.raises(lt.InputError, match="no baths"):
+        spin(None).temperature(x[:, :3])
+
+
+def test_systems_with_a_temperature_of_their_own_have_both_forms():
+    gas = lt.EvolutionSystem(lambda x: 0.5 * x[1] ** 2 + jnp.exp(x[2]), 3)
+    x = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, np.log(5.0)]])
+    np.testing.assert_allclose(gas.temperature(x), [1.0, 5.0], rtol=1e-14)
+    np.testing.assert_allclose(gas.temperatures(x), [[1.0], [5.0]], rtol=1e-14)
+    wheels = lt.models.body_with_wheels()
+    y = wheels.state(angular_velocity=(0.1, 0.2, 0.3), temperature=1.7)
+    assert float(wheels.temperature(y)) == pytest.approx(1.7, rel=1e-14)
+    assert wheels.temperatures(y).shape == (1,)
+    assert float(wheels.temperatures(y)[0]) == pytest.approx(1.7, rel=1e-14)

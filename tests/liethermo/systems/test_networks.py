@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import liethermo as lt
 from liethermo.engines import sparse_engine
-from liethermo.functions.gradients import DISCRETE_GRADIENTS, stage_gradients
+from liethermo.functions.gradients import DISCRETE_GRADIENTS, discrete_gradients_at_stages
 from liethermo.integrators.tableaus import gauss_tableau
 from liethermo.models.thermo_particles import grid_adjacency_matrix, heat_grid_solution
 from tests.cases import tolerance
@@ -71,7 +71,7 @@ def assert_both_laws(solution, content=0.0):
 def value_and_gradients(energy, x, d, k):
     """Value, gradient and all discrete gradients."""
     A, b, _ = gauss_tableau(2)
-    stages = stage_gradients(energy, x, 0.0 * x, 0.1, k, A, b)
+    stages = discrete_gradients_at_stages(energy, x, 0.0 * x, 0.1, k, A, b)
     return [energy.value(x), energy.gradient(x), *(g(energy, x, d) for g in DISCRETE_GRADIENTS.values()), stages]
 
 
@@ -413,7 +413,7 @@ def test_unusable_files(tmp_path, text, options, words):
 def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(lt.FileError, match="there is no file"):
         lt.read_graph(tmp_path / "none.csv")
-    with pytest.raises(lt.FileError, match=r"neither .csv nor .graphml"):
+    with pytest.raises(lt.FileError, match=r"must be .csv or .graphml, got"):
         lt.read_graph(write_file(tmp_path, CSV, "graph.txt"))
     (tmp_path / "binary.csv").write_bytes(b"source,target,conductance\n\xff\xfe,1,2\n")
     with pytest.raises(lt.FileError, match="cannot be read as CSV"):

@@ -12,8 +12,8 @@ import manifolds as mf
 from liethermo.engines import array_engine
 from liethermo.engines.solver_options import DEFAULT_OPTIONS
 from liethermo.engines.step import initial_run_state_program, reorder_components, take_step
-from liethermo.functions.gradients import DISCRETE_GRADIENTS, stage_gradients
-from liethermo.functions.on_spaces import to_component_order, to_site_order
+from liethermo.functions.gradients import DISCRETE_GRADIENTS, discrete_gradients_at_stages
+from liethermo.functions.on_spaces import spins_to_component_order, spins_to_site_order
 from liethermo.integrators.base import pullback_method
 from liethermo.integrators.tableaus import gauss_tableau, kronrod_rule
 from liethermo.systems.spins import reorder_spins
@@ -92,7 +92,7 @@ def evaluate_functions(system, x, d, compensation, k):
         for scheme in DISCRETE_GRADIENTS.values()
         if scheme.is_coordinate_order_independent
     ]
-    stages = stage_gradients(energy, x, compensation, 0.1, k, A, b, kronrod_rule(2))
+    stages = discrete_gradients_at_stages(energy, x, compensation, 0.1, k, A, b, kronrod_rule(2))
     vectors = jnp.stack([energy.gradient(x), system.vector_field(x), *gradients, *stages])
     return jnp.stack([energy.value(x), energy.sensitivity(x)]), energy.rounding_scale(x), vectors
 
@@ -249,8 +249,8 @@ def test_what_has_no_other_order():
 
 def test_the_two_orders():
     x = np.arange(14.0)
-    assert to_component_order(x, 4).tolist() == [0, 3, 6, 9, 1, 4, 7, 10, 2, 5, 8, 11, 12, 13]
-    np.testing.assert_array_equal(to_site_order(to_component_order(np.stack([x, -x]), 4), 4), [x, -x])
+    assert spins_to_component_order(x, 4).tolist() == [0, 3, 6, 9, 1, 4, 7, 10, 2, 5, 8, 11, 12, 13]
+    np.testing.assert_array_equal(spins_to_site_order(spins_to_component_order(np.stack([x, -x]), 4), 4), [x, -x])
 
 
 def test_control_a_wrong_order_is_seen():

@@ -246,6 +246,42 @@ def test_a_step_that_leaves_the_cone_ends_the_run_and_a_shorter_one_stays_inside
     assert np.abs(q.density(shorter.x[-1]) - exact).max() <= 1e-3
 
 
+STIFF = {
+    "2 levels": ((4.0,), lt.MetriplecticGauss(2), 0.03, 2.0),
+    "3 levels": ((1.0, 4.0), lt.MetriplecticGauss(2), 0.015, 1.5),
+    "3 levels by the midpoint": ((1.0, 4.0), lt.MetriplecticMidpoint(), 0.002, 1.0),
+    "4 levels": ((1.0, 3.0, 3.0), lt.MetriplecticGauss(2), 0.01, 3.0),
+    "3 levels by three stages": ((1.0, 2.0), lt.MetriplecticGauss(3), 0.015, 1.5),
+}
+
+
+@pytest.mark.sampled("2 levels")
+@pytest.mark.parametrize("name", STIFF)
+def test_stiff_steps_rest_in_a_cold_state(name):
+    """Steps of several relaxation times: from rest, updates of a diverging iteration begin at rounding."""
+    gaps, method, step, end = STIFF[name]
+    size, rate, temperature = len(gaps) + 1, 100.0, 0.1
+    U = np.linalg.qr(random_hermitian(size))[0]
+    H, V = (np.diag(np.cumsum((0.0, *gaps))), np.diag(np.sqrt(np.arange(1.0, size)), 1))
+    jumps = []
+    for gap in set(gaps):
+        part = np.zeros((size, size))
+        for k in np.flatnonzero(np.asarray(gaps) == gap):
+            part[k, k + 1] = V[k, k + 1]
+        jumps += [(U @ part @ U.conj().T, rate), (U @ part.T @ U.conj().T, rate * np.exp(-gap / temperature))]
+    H, V = (U @ M @ U.conj().T for M in (H, V))
+    H = (H + H.conj().T) / 2
+    coupling = (V, lambda omega, T: rate * jnp.exp(-omega / (2.0 * T)))
+    q = lt.QuantumSystem(H, lt.ThermalJumps([coupling]), infinite(temperature))
+    rho, basis = random_density(size), np.eye(size**2).reshape(-1, size, size)
+    generator = np.stack([lindblad(E, H, jumps).ravel() for E in basis], axis=1)
+    run = lt.integrate(q, q.state(rho), (0.0, end), step, method)
+    exact = (scipy.linalg.expm(run.t[-1] * generator) @ rho.ravel()).reshape(size, size)
+    assert np.abs(q.density(run.x[-1]) - exact).max() <= 1e-13
+    audit = run.audit()
+    assert audit.passed, audit
+
+
 @pytest.mark.sampled("midpoint")
 @pytest.mark.parametrize("by", COLD)
 def test_a_cold_state_of_gibbs_is_at_rest(by):
@@ -413,8 +449,8 @@ def test_operators_of_other_libraries_are_read_by_their_matrices():
 BAD = {
     "term 1 of the Hamiltonian is not Hermitian": lambda q: lt.QuantumSystem([QUBIT, (LOWER, jnp.cos)]),
     "term 1 of the Hamiltonian has shape": lambda q: lt.QuantumSystem([QUBIT, (np.eye(3), jnp.cos)]),
-    "term 1 of the Hamiltonian is a matrix, or a pair": lambda q: lt.QuantumSystem([QUBIT, (X, 0.5)]),
-    "term 0 of the Hamiltonian is a matrix, or a pair": lambda q: lt.QuantumSystem([[X, 0.5], QUBIT]),
+    "term 1 of the Hamiltonian must be a matrix, or a pair": lambda q: lt.QuantumSystem([QUBIT, (X, 0.5)]),
+    "term 0 of the Hamiltonian must be a matrix, or a pair": lambda q: lt.QuantumSystem([[X, 0.5], QUBIT]),
     "of term 1 of the Hamiltonian must return a real number": lambda q: lt.QuantumSystem(
         [QUBIT, (X, lambda t: 1j * t)]
     ),

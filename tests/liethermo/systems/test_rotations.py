@@ -178,6 +178,9 @@ def test_a_state_has_the_angular_velocity_and_temperature_it_was_given(name):
             lt.bodies.rotor_rates(solution)
     both = system.state(angular_velocity=np.stack([omega, 2 * omega]), batch=True, **rates, **heat)
     assert np.allclose(both[0], x0)
+    rates_in_degrees = {key: np.degrees(value) for key, value in rates.items()}
+    in_degrees = system.state(angular_velocity=np.degrees(omega), degrees=True, **rates_in_degrees, **heat)
+    assert np.allclose(in_degrees, x0, rtol=1e-13, atol=1e-15)
 
 
 def test_a_state_of_a_quartic_energy_is_found_by_newtons_method():
@@ -197,7 +200,8 @@ def test_a_state_of_a_quartic_energy_is_found_by_newtons_method():
         ({"angular_velocity": [1.0, 0, np.inf]}, "finite"),
         ({"angular_velocity": [1.0, 0, 0], "rotor_rates": [1.0]}, "a body with rotors"),
         ({"angular_velocity": [1.0, 0, 0], "temperature": -1.0}, "positive"),
-        ({"x": [1.0, 0, 0], "temperature": 1.0}, "needs x"),
+        ({"x": [1.0, 0, 0], "temperature": 1.0}, "temperature= of a state needs angular_velocity=, not x"),
+        ({"x": [1.0, 0, 0], "degrees": True}, "degrees= of a state needs angular_velocity="),
     ],
 )
 def test_bad_states_are_refused(arguments, message):

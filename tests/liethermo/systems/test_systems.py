@@ -339,7 +339,7 @@ def test_members_that_are_not_called_any_more_are_refused():
     with pytest.raises(TypeError, match=r"Earlier defines outside, which nothing calls\. Override domain"):
         type("Earlier", (lt.MetriplecticSystem,), {"outside": lambda self, x: "too hot"})
     kind = type("Kind", (lt.MetriplecticSystem,), {"domain": Domain(why_outside=lambda x: "too hot")})
-    assert kind(None, lambda x: x[0] ** 2, dim=1).outside(jnp.ones(1)) == "too hot"
+    assert kind(None, lambda x: x[0] ** 2, dim=1).domain.why_outside(jnp.ones(1)) == "too hot"
 
 
 def test_what_a_system_says_of_first_states_is_heard_through_what_it_is_run_as():

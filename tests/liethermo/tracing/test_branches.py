@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax import lax
 
-from liethermo.tracing.branches import MIN_BRANCH_COST, Branch, instructions_in_branches
+from liethermo.tracing.branches import MIN_BRANCH_COST, Branch, sink_instructions_into_branches
 from tests.liethermo.tracing.test_scalarize import program_of
 from tests.machine_code import compile_program
 
@@ -35,7 +35,7 @@ def instructions_with_depth(items, depth: int = 0):
 
 def checked_branches(program, **options):
     """Nest the branches of a program; assert that every instruction occurs once and after its arguments."""
-    items = instructions_in_branches(program, **options)
+    items = sink_instructions_into_branches(program, **options)
     order = [instruction for instruction, _ in instructions_with_depth(items)]
     assert sorted(order) == sorted(program.instructions)
     defined_names = {name for names in program.inputs for name in names}

@@ -186,14 +186,14 @@ def python_sum(x):
 @pytest.fixture
 def loaded_programs(folder, monkeypatch):
     """Return a list that says of each program whether it was loaded; every program is written."""
-    loads, load = [], programs._stored_program
+    loads, load = [], programs._load_stored_program
 
     def noting_load(*arguments):
         program = load(*arguments)
         loads.append(program is not None)
         return program
 
-    monkeypatch.setattr(programs, "_stored_program", noting_load)
+    monkeypatch.setattr(programs, "_load_stored_program", noting_load)
     monkeypatch.setattr(programs, "MIN_STORED_COMPILE_SECONDS", 0.0)
     jax_folder = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", None)

@@ -9,7 +9,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.tracing.interpret import array_degree_bound
+from liethermo.tracing.interpret import jaxpr_degree_bound
 from liethermo.tracing.scalarize import scalarize
 
 A = np.random.default_rng(0).standard_normal((4, 3, 3))
@@ -46,13 +46,13 @@ def trace(function):
 def test_array_degrees_equal_those_of_the_unrolled_program(name):
     function, expected = POLYNOMIALS[name]
     closed_jaxpr = trace(function)
-    assert array_degree_bound(closed_jaxpr, 0) == expected
-    assert scalarize(closed_jaxpr).degree(0) == expected
+    assert jaxpr_degree_bound(closed_jaxpr, 0) == expected
+    assert scalarize(closed_jaxpr).degree_bound(0) == expected
 
 
 @pytest.mark.parametrize("name", OTHER_FUNCTIONS)
 def test_other_functions_have_infinite_degree(name):
-    assert array_degree_bound(trace(OTHER_FUNCTIONS[name]), 0) == math.inf
+    assert jaxpr_degree_bound(trace(OTHER_FUNCTIONS[name]), 0) == math.inf
 
 
 def test_a_plain_function_on_many_sites_is_known_as_quadratic():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import liethermo.tracing.primitives as primitives
-from liethermo.tracing.builder import elementwise
+from liethermo.tracing.builder import map_elementwise
 from liethermo.tracing.scalarize import CONTROL_FLOW_RULES
 from tests import fuzz
 from tests.fuzz_operations import OPERATIONS
@@ -76,7 +76,7 @@ def test_comparison_detects_a_wrong_rule(name, monkeypatch):
     rule = primitives.UNROLLING_RULES[name]
 
     def wrong_rule(b, eqn, *arrays):
-        return elementwise(lambda a: b.mul(a, 1.0 + 1e-9), rule(b, eqn, *arrays))
+        return map_elementwise(lambda a: b.mul(a, 1.0 + 1e-9), rule(b, eqn, *arrays))
 
     monkeypatch.setitem(primitives.UNROLLING_RULES, name, wrong_rule)
     function = fuzz.random_function(1, [name], steps=1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.special
 
-from liethermo.tracing.taylor import TaylorSeriesError, check_taylor_series, increment_taylor_coefficients
+from liethermo.tracing.taylor import TaylorSeriesError, check_has_taylor_series, solution_taylor_coefficients
 
 ORDER = 20
 
@@ -169,7 +169,7 @@ def test_recurrences_agree_with_cauchy_integrals():
         values = [function(state[i]) for i, (function, *_) in enumerate(FUNCTIONS.values())]
         return jnp.concatenate([jnp.ones(len(points)), jnp.stack(values)])
 
-    coefficients = jax.jit(lambda x: increment_taylor_coefficients(field, x, 1.0, ORDER))(
+    coefficients = jax.jit(lambda x: solution_taylor_coefficients(field, x, 1.0, ORDER))(
         jnp.concatenate([points, jnp.zeros(len(points))])
     )
     coefficients = np.asarray(coefficients)[:, len(points) :] * np.arange(1, ORDER + 1)[:, None]
@@ -182,9 +182,9 @@ def test_recurrences_agree_with_cauchy_integrals():
 def test_coefficients_of_a_known_solution():
     """The coefficients of ``x' = x^2`` are powers of h x; in units of h they neither overflow nor underflow."""
     for h, x in ((0.5, 0.8), (1e-100, 1e100)):
-        coefficients = np.asarray(increment_taylor_coefficients(lambda x: x * x, jnp.array([x]), h, 24))[:, 0]
+        coefficients = np.asarray(solution_taylor_coefficients(lambda x: x * x, jnp.array([x]), h, 24))[:, 0]
         assert np.allclose(coefficients, x * (h * x) ** np.arange(1, 25), rtol=1e-14, atol=0.0)
-    constant = np.asarray(increment_taylor_coefficients(lambda x: jnp.array([2.0, 3.0]), jnp.zeros(2), 0.5, 6))
+    constant = np.asarray(solution_taylor_coefficients(lambda x: jnp.array([2.0, 3.0]), jnp.zeros(2), 0.5, 6))
     assert np.array_equal(constant, [[1.0, 1.5], *np.zeros((5, 2))])
 
 
@@ -206,9 +206,9 @@ def test_coefficients_of_a_known_solution():
 )
 def test_refusals(function, primitive):
     with pytest.raises(TaylorSeriesError, match=f"'{primitive}'") as error:
-        check_taylor_series(function, 0.5)
+        check_has_taylor_series(function, 0.5)
     assert error.value.primitive == primitive
-    check_taylor_series(lambda x: jnp.where(function(x) > 0.0, x, x * x), 0.5)  # a test needs no series
+    check_has_taylor_series(lambda x: jnp.where(function(x) > 0.0, x, x * x), 0.5)  # a test needs no series
 
 
 def shifted_abs(x):
@@ -217,4 +217,4 @@ def shifted_abs(x):
 
 def test_a_refusal_names_the_line():
     with pytest.raises(TaylorSeriesError, match=r"'abs' is not smooth \(test_taylor.py:\d+, in shifted_abs\)"):
-        check_taylor_series(shifted_abs, 0.5)
+        check_has_taylor_series(shifted_abs, 0.5)

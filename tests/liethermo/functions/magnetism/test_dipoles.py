@@ -10,7 +10,7 @@ import pytest
 import scipy.special as special
 
 import liethermo as lt
-from liethermo.functions.magnetism.dipoles import lattice_kernel, padded_length
+from liethermo.functions.magnetism.dipoles import dipolar_lattice_kernel, padded_length
 from liethermo.functions.magnetism.ewald import dipole_tensor, ewald_kernel, transform_axes
 from tests.refusals import refusal_test
 
@@ -51,7 +51,7 @@ def test_open_lattices_are_direct_sums(name, cells):
 
 def transform_of(crystal):
     """Return the transforms of the six components, shape (6, atoms, atoms, ...), axes in the order of the lattice."""
-    kernel = lattice_kernel(crystal, "tin foil")
+    kernel = dipolar_lattice_kernel(crystal, "tin foil")
     return np.moveaxis(np.stack(kernel.components), 3, 3 + transform_axes(kernel.padded_cells)[-1])
 
 

@@ -11,7 +11,7 @@ from liethermo.functions.magnetism.newell import (
     _mean_dipole_tensors,
     demagnetising_tensors,
     mirror_octant,
-    triangle_rule,
+    triangle_density_gauss_rule,
 )
 from tests.refusals import refusal_test
 
@@ -79,7 +79,7 @@ def test_the_tensor_of_two_cells_is_its_integral():
     r = np.array([3.0, 1.6, 0.6])
     by_quadrature = _mean_dipole_tensors(r[None], np.array([1.0, 0.8, 0.6]), 12)[:, 0]
     np.testing.assert_allclose(N[:, 3, 2, 1], by_quadrature, atol=1e-13)
-    points, weights = triangle_rule(6)
+    points, weights = triangle_density_gauss_rule(6)
     for power in range(12):  # moments of 1 - |t|
         exact = 0.0 if power % 2 else 2.0 / ((power + 1) * (power + 2))
         assert weights @ points**power == pytest.approx(exact, abs=1e-14)

@@ -267,3 +267,14 @@ BAD = {
 
 
 test_bad_terms_are_refused = refusal_test(BAD, error=lt.LiethermoError)
+
+
+def test_a_term_takes_spins_in_the_shape_of_their_lattice():
+    terms = [mag.exchange(BONDS, 0.7), mag.anisotropy(KAGOME, 0.2), mag.zeeman(KAGOME, (0.1, 0.0, 1.0))]
+    many = np.stack([random_spins(KAGOME.sites) for _ in range(2)])
+    for energy in (*terms, terms[0] + terms[1], -terms[0], 2.0 * terms[0]):
+        flat = energy(many.reshape(2, -1))
+        assert np.array_equal(energy(many), flat)
+        assert float(energy(many[0])) == flat[0]
+    with pytest.raises(lt.InputError, match=r"spins must have shape \(\.\.\., 3, 4, 3, 3\) or \(\.\.\., 108\)"):
+        terms[0](many[0, 0])
