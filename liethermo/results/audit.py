@@ -403,7 +403,7 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
     if stats.spatial_momentum_change is not None:
         rows.append(_spatial_momentum_row(stats.spatial_momentum_change, laws, tolerances))
     rows += condition_rows(evidence)
-    rows += _accuracy_and_consistency_rows(evidence, tolerances)
+    rows += accuracy_and_consistency_rows(evidence, tolerances)
     status = solution.status  # a run stopped by its user is short, but breaks no law
     has_failed = not status.ok and status.code != StatusCode.INTERRUPTED.status_name
     rows.append(
@@ -452,9 +452,9 @@ UNPROMISED_CONSTANT_NOTE = "a constant of this system, but the method does not c
 """Note of a conserved function that the method does not conserve exactly."""
 
 
-def _accuracy_and_consistency_rows(evidence: Evidence, tolerances: Tolerances) -> list[AuditRow]:
+def accuracy_and_consistency_rows(evidence: Evidence, tolerances: Tolerances) -> list[AuditRow]:
     """Return the rows of accuracy and consistency."""
-    rows, inconsistency = [accuracy_row(evidence, tolerances)], evidence.inconsistency
+    rows, inconsistency = [_accuracy_row(evidence, tolerances)], evidence.inconsistency
     if inconsistency is not None:
         row = _judged_row(CONSISTENCY_ROW, inconsistency, tolerances.consistency)
         note = "" if row.passed else "short steps of this method do not follow the vector field of this system"
@@ -467,7 +467,7 @@ def condition_rows(evidence: Evidence) -> list[AuditRow]:
     return [AuditRow(c.name, c.value, c.limit, c.holds, c.note, c.concerns_model) for c in evidence.conditions]
 
 
-def accuracy_row(evidence: Evidence, tolerances: Tolerances) -> AuditRow:
+def _accuracy_row(evidence: Evidence, tolerances: Tolerances) -> AuditRow:
     """Return the row that judges whether the steps resolve the motion."""
     if evidence.local_error is None:
         return AuditRow(ACCURACY_ROW, np.nan, None, None, "the local errors were not estimated")

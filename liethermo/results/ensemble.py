@@ -20,7 +20,7 @@ from .audit import (
     Audit,
     AuditRow,
     Tolerances,
-    accuracy_row,
+    accuracy_and_consistency_rows,
     check_laws,
     condition_rows,
     coverage_text,
@@ -308,13 +308,13 @@ class Ensemble(AuditableResult):
     ) -> Audit:
         """Audit the laws at every step of every trajectory; each row shows the worst trajectory.
 
-        Local errors are measured along at most 32 trajectories (with adaptive steps, in the first step). Conserved
+        Steps are examined along at most 32 trajectories (with adaptive steps, the first of each). Conserved
         functions, and conditions such as the positivity of density matrices, are evaluated at the saved states of these
         trajectories. If not all steps were checked, the verdict says how many.
 
         Parameters
         ----------
-        energy, entropy, casimirs, residual, accuracy : float
+        energy, entropy, casimirs, residual, accuracy, consistency : float
             Tolerances: see :class:`liethermo.results.audit.Tolerances`.
 
         Raises
@@ -330,7 +330,7 @@ class Ensemble(AuditableResult):
         rows += [invariant_row(name, drift, limits) for name, drift in drifts.items()]
         rows += [residual_row, *condition_rows(self.evidence)]
         if self.evidence_source is not None or self.evidence.local_error is not None:
-            rows.append(accuracy_row(self.evidence, limits))
+            rows += accuracy_and_consistency_rows(self.evidence, limits)
         n_failed = int((~self.ok & (self.status != StatusCode.INTERRUPTED)).sum())
         rows.append(AuditRow(FAILED_TRAJECTORIES_ROW, n_failed, 0, n_failed == 0))
         min_entropy_increment = (

@@ -1,4 +1,4 @@
-"""Steps of a run that an audit checks: all of them, or those where the motion is fastest.
+"""Steps that an audit checks: all steps of a run, or those where the motion is fastest.
 
 Each step is compared with the vector field at its ends and at points between, so that it cannot jump over a feature.
 """
@@ -30,24 +30,31 @@ MIN_SAMPLED_STEPS = 8
 
 
 class StepSample(NamedTuple):
-    """Sample of the steps of a run, in any order.
+    """Sample of the steps of one or several trajectories, in any order.
 
     Attributes
     ----------
+    trajectory : array of int, shape (m,)
+        Indices of the trajectories to which the steps belong.
     t, h : array, shape (m,)
         Times at which the steps begin, and their sizes.
     x, x_end : array, shape (m, n)
         States at which they begin and end.
     """
 
+    trajectory: np.ndarray
     t: np.ndarray
     h: np.ndarray
     x: np.ndarray
     x_end: np.ndarray
 
+    def select(self, indices: np.ndarray) -> StepSample:
+        """Return the steps with these indices."""
+        return StepSample(*(values[indices] for values in self))
+
 
 def select_step_sample(system: System, x: np.ndarray, t: np.ndarray, h: np.ndarray, replay: Callable) -> StepSample:
-    """Return a sample of the steps of a run: all, or if these are too many, those with the fastest motion.
+    """Return a sample of the steps of a single run: all, or if these are too many, those with the fastest motion.
 
     Parameters
     ----------
@@ -74,14 +81,15 @@ def select_step_sample(system: System, x: np.ndarray, t: np.ndarray, h: np.ndarr
     cumulative_cost = np.cumsum(costs[order])
     order = order[cumulative_cost - costs[order] < budget]
     if has_both_ends[order].all():
-        return StepSample(t[order], h[order], x[order], x[order + 1])
+        return StepSample(np.zeros_like(order), t[order], h[order], x[order], x[order + 1])
     samples: list[StepSample] = []
     for i in order:
         states = x[i : i + 2]
         if not has_both_ends[i]:
             states = np.vstack([x[i], replay(x[i], h[i], min(counts[i], -(-budget // REPLAY_COST_RATIO)))])
-        step_sizes = np.full(len(states) - 1, h[i])
-        samples.append(StepSample(t[i] + h[i] * np.arange(len(step_sizes)), step_sizes, states[:-1], states[1:]))
+        numbers = np.arange(len(states) - 1)
+        sizes = np.full(len(numbers), h[i])
+        samples.append(StepSample(np.zeros_like(numbers), t[i] + h[i] * numbers, sizes, states[:-1], states[1:]))
         budget -= costs[i]
     return StepSample(*(np.concatenate(arrays) for arrays in zip(*samples, strict=True)))
 
@@ -106,7 +114,7 @@ def hermite_defect(field: Callable, steps: StepSample) -> np.ndarray:
 
     Parameters
     ----------
-    field : function of step indices and states, shape (steps, q, n), to an array of that shape
+    field : function of trajectories, shape (steps,), and states, shape (steps, q, n), to an array of that shape
         The vector field.
     """
     n_steps, n = steps.x.shape
@@ -128,13 +136,14 @@ def hermite_defect(field: Callable, steps: StepSample) -> np.ndarray:
     defects, block_size = np.zeros(n_steps), max(1, MAX_FIELD_VALUES_PER_CALL // (n * n_points))
     for start in range(0, n_steps, block_size):
         indices = np.arange(start, min(start + block_size, n_steps))
-        x, x_end, h = steps.x[indices], steps.x_end[indices], steps.h[indices, None]
+        trajectory, _, sizes, x, x_end = steps.select(indices)
+        h = sizes[:, None]
         ends = np.stack([x, x_end], axis=1)
-        slopes = h[:, None] * field(indices, ends)
+        slopes = h[:, None] * field(trajectory, ends)
         data = [v[:, i : i + 1] for i in (0, 1) for v in (ends, slopes)]
         cubic_states = sum(c * v for c, v in zip(value_weights, data, strict=True))
         defect = np.abs(
-            h[:, None] * field(indices, cubic_states) - sum(c * v for c, v in zip(slope_weights, data, strict=True))
+            h[:, None] * field(trajectory, cubic_states) - sum(c * v for c, v in zip(slope_weights, data, strict=True))
         ).max(axis=2)
         defects[indices] = np.nan_to_num(defect, nan=0.0, posinf=1e300).mean(axis=1)
     return defects
@@ -143,8 +152,9 @@ def hermite_defect(field: Callable, steps: StepSample) -> np.ndarray:
 def vector_field_at(system: System, x: np.ndarray) -> np.ndarray:
     """Return the vector field at states, shape (m, n)."""
     with np.errstate(all="ignore"):
-        return np.asarray(evaluate_at_points(_vector_field, system, x))
+        return np.asarray(evaluate_at_points(vector_field, system, x))
 
 
-def _vector_field(system: System, x):
+def vector_field(system: System, x):
+    """Return the vector field of a system at x, shape (n,)."""
     return system.vector_field(x)

@@ -11,18 +11,10 @@ from ..engines.adaptive_runs import AdaptiveRuns, EventRules, PauseHandler, star
 from ..engines.compiled.engine import CompiledAdaptiveRuns
 from ..engines.status_codes import StatusCode
 from ..engines.step import REPORTED_FIELDS
-from ..engines.step_control import StepControl
 from ..systems import System
 from .driver import drive_adaptive
-from .ensemble_lanes import (
-    ARRAY_BATCH_SIZE,
-    RECORDED_INITIAL_FIELDS,
-    LaneParameters,
-    ProgressCounter,
-    padded_member_indices,
-    run_in_threads,
-)
-from .record import GroupRecord
+from .ensemble_lanes import RECORDED_INITIAL_FIELDS, EnsembleRun
+from .lanes import LaneParameters
 
 ATTEMPTS_PER_CALL_RANGE = (16, 2048)
 """Smallest and largest number of attempted steps per engine call; paused trajectories wait until the call ends."""
@@ -39,77 +31,36 @@ RUNNING_CODES = (StatusCode.COMPLETED, StatusCode.PAUSED_AT_STOP, StatusCode.PAU
 """Status codes of trajectories that go on."""
 
 
-class AdaptiveEnsembleRun:
-    """Run of a group of trajectories of an ensemble with adaptive steps or events.
-
-    Parameters
-    ----------
-    record : GroupRecord
-    control : StepControl
-        The control of the group.
-    progress_counter : ProgressCounter
-    """
-
-    def __init__(self, record: GroupRecord, control: StepControl, progress_counter: ProgressCounter):
-        self.family, self.method, self.events, self.control = record.family, record.method, record.events, control
-        self.record, self.progress_counter, self.interrupted = record, progress_counter, False
-        self.stop_times = record.schedule.stop_times
+class AdaptiveEnsembleRun(EnsembleRun):
+    """Run of a group of trajectories of an ensemble with adaptive steps or events."""
 
     @property
     def _start_stop_length(self) -> tuple[float, float, float]:
-        schedule = self.record.schedule
-        return schedule.start, float(self.stop_times[0]), schedule.end - schedule.start
+        schedule = self.group.schedule
+        return schedule.start, float(schedule.stop_times[0]), schedule.end - schedule.start
 
-    def run_compiled(self) -> None:
-        """Run all trajectories in SIMD lanes over threads; finished ones free their lanes."""
-        lanes, n_members = LaneParameters(self.family, self.method, self.control), len(self.record.x0)
+    def _run_lanes(self, lanes: LaneParameters, members: slice, stop: threading.Event) -> None:
+        parameters, x0 = lanes.parameters(members, members.stop - members.start), self.group.x0[members]
+        adaptive_runs = CompiledAdaptiveRuns(
+            lanes.step_loop, lanes.first_lane_parameters, parameters, x0, *self._start_stop_length
+        )
+        # finished trajectories free their lanes
+        indices, keep_only = np.arange(members.start, members.stop), adaptive_runs.keep_only
+        self._advance_to_end(_BatchRecorder(self, adaptive_runs, indices, keep_only, stop.is_set))
 
-        def work(members: slice, stop: threading.Event) -> None:
-            parameters = lanes.parameters(members, members.stop - members.start)
-            adaptive_runs = CompiledAdaptiveRuns(
-                lanes.step_loop,
-                lanes.first_lane_parameters,
-                parameters,
-                self.record.x0[members],
-                *self._start_stop_length,
-            )
-            self._advance_to_end(
-                adaptive_runs, np.arange(members.start, members.stop), adaptive_runs.keep_only, stop.is_set
-            )
+    def _run_batch(self, members: np.ndarray, n_members: int) -> None:
+        group = self.group
+        assert group.control is not None
+        arguments = group.family.form, *group.family.vmap_arguments(members), group.method, group.control
+        adaptive_runs = start_adaptive_runs(*arguments, group.x0[members], *self._start_stop_length)
+        self._advance_to_end(_BatchRecorder(self, adaptive_runs, members, None, lambda: False))
 
-        run_in_threads(work, n_members)
-
-    def run_array(self) -> None:
-        """Run all trajectories on the array engine, one vmapped program per batch."""
-        n_members = len(self.record.x0)
-        for start in range(0, n_members, ARRAY_BATCH_SIZE):
-            members = padded_member_indices(start, min(start + ARRAY_BATCH_SIZE, n_members), self.record.x0.shape[1])
-            parameters, axes = self.family.vmap_arguments(members)
-            batch_arguments = self.family.form, parameters, axes, self.method, self.control
-            adaptive_runs = start_adaptive_runs(*batch_arguments, self.record.x0[members], *self._start_stop_length)
-            self._advance_to_end(adaptive_runs, members, None, lambda: self.interrupted)
-
-    def _advance_to_end(
-        self,
-        adaptive_runs: AdaptiveRuns,
-        members: np.ndarray,
-        keep_only: Callable | None,
-        is_stopped: Callable[[], bool],
-    ) -> None:
-        """Advance the trajectories with these member indices until all have ended, and fill the record.
-
-        Parameters
-        ----------
-        keep_only : function of indices, or None
-            Removes all other trajectories from the batch.
-        is_stopped : function
-            Returns True if the user has interrupted the run.
-        """
-        recorder = _BatchRecorder(self, adaptive_runs, members, keep_only, is_stopped)
+    def _advance_to_end(self, recorder: _BatchRecorder) -> None:
+        """Advance the trajectories of a recorder until all have ended, and fill the record."""
         try:
             drive_adaptive(recorder.pause_handler, recorder)
         except KeyboardInterrupt:
-            self.interrupted = True
+            self.is_interrupted = True
         recorder.record_interrupted()
 
 
@@ -121,9 +72,11 @@ class _BatchRecorder:
     run : AdaptiveEnsembleRun
     adaptive_runs : AdaptiveRuns
     members : array of int
-        Numbers of the trajectories in the ensemble.
-    keep_only, is_stopped
-        See :meth:`AdaptiveEnsembleRun._advance_to_end`.
+        Indices of the trajectories in the group.
+    keep_only : function of indices, or None
+        Removes all other trajectories from the batch.
+    is_stopped : function
+        Returns True if the user has interrupted the run.
     """
 
     def __init__(
@@ -134,19 +87,19 @@ class _BatchRecorder:
         keep_only: Callable | None,
         is_stopped: Callable[[], bool],
     ):
-        self.run, self.runs, self.members = run, adaptive_runs, members
-        self.record, self.keep_only, self.is_stopped = run.record, keep_only, is_stopped
-        rules = EventRules() if run.events is None else run.events.rules
-        self.pause_handler = PauseHandler(
-            adaptive_runs, run.control, run.method, run.stop_times, self._system_of, rules
-        )
+        self.runs, self.members, self.group, self.record = adaptive_runs, members, run.group, run.record
+        self.progress_counter, self.keep_only, self.is_stopped = run.progress_counter, keep_only, is_stopped
+        control, events, stop_times = self.group.control, self.group.events, self.group.schedule.stop_times
+        assert control is not None
+        rules = EventRules() if events is None else events.rules
+        self.pause_handler = PauseHandler(adaptive_runs, control, self.group.method, stop_times, self._system_of, rules)
         self.initial = {name: adaptive_runs.read(name).copy() for name in RECORDED_INITIAL_FIELDS}
         self.record.record_initial(members, self.initial["x"], self.initial["energy"], self.initial["entropy"])
         self.is_running = np.ones(len(members), dtype=bool)
         self._is_first_attempt = True
 
     def _system_of(self, i: int) -> System:
-        return self.run.family.member(int(self.members[i]))
+        return self.group.family.member(int(self.members[i]))
 
     def continues(self) -> bool:
         return bool(self.is_running.any()) and not self.is_stopped()
@@ -162,8 +115,8 @@ class _BatchRecorder:
 
         A trajectory that pauses or ends before has the size that it would attempt.
         """
-        start, runs = self.record.schedule.start, self.runs
-        sizes = np.minimum(runs.read("next_step_size"), self.record.schedule.end - start)
+        start, runs = self.group.schedule.start, self.runs
+        sizes = np.minimum(runs.read("next_step_size"), self.group.schedule.end - start)
         is_pending = np.ones(len(self.members), dtype=bool)
         for _ in range(MAX_FIRST_ATTEMPTS):
             runs.advance(1)
@@ -176,12 +129,12 @@ class _BatchRecorder:
 
     def record_pauses(self) -> None:
         handler, runs = self.pause_handler, self.runs
-        if self.run.events is not None:
-            self.run.events.raise_first_error()
+        if self.group.events is not None:
+            self.group.events.raise_first_error()
             self.record.store_events(handler.occurrences, self.members)
             handler.occurrences.clear()
         indices = handler.paused_indices(StatusCode.PAUSED_AT_STOP)
-        indices = indices[np.isin(runs.read("t", indices), self.record.schedule.saved_stop_times)]
+        indices = indices[np.isin(runs.read("t", indices), self.group.schedule.saved_stop_times)]
         if indices.size:
             columns = [runs.read("x", indices), *(runs.read(n, indices)[:, None] for n in ("energy", "entropy"))]
             self.record.store_states_at(self.members[indices], runs.read("t", indices), np.hstack(columns))
@@ -193,7 +146,7 @@ class _BatchRecorder:
             reached_end = status[indices] == StatusCode.REACHED_END
             self._finish(indices, np.where(reached_end, StatusCode.COMPLETED, status[indices]))
         self.is_running[indices] = False
-        self.run.progress_counter.add(np.unique(self.members[indices]).size)
+        self.progress_counter.add(np.unique(self.members[indices]).size)
         if self.keep_only is not None and 2 * self.is_running.sum() <= len(self.members) and self.is_running.any():
             running = np.flatnonzero(self.is_running)
             self.keep_only(running)

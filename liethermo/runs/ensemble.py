@@ -22,7 +22,7 @@ from ..systems.rotations import attitude_array
 from ..tracing.scalarize import UnsupportedPrimitive
 from .adaptive import Adaptive, make_step_control
 from .adaptive_ensemble import AdaptiveEnsembleRun
-from .ensemble_lanes import MAX_THREADS, FixedEnsembleRun, ProgressCounter, replay_steps
+from .ensemble_lanes import MAX_THREADS, FixedEnsembleRun, ProgressCounter
 from .events import EventSet, Until
 from .member_groups import common_inertia, group_members_by_invariants, members_outside_domain
 from .noise import Fluctuations, NoisePaths, check_noise
@@ -177,7 +177,7 @@ def ensemble(
             if group_record.is_interrupted:
                 break
             n_done += len(group_record.numbers)
-    return record.to_ensemble(replay_steps, reasons, provenance, wall_time=time.perf_counter() - start_time)
+    return record.to_ensemble(reasons, provenance, wall_time=time.perf_counter() - start_time)
 
 
 def _update_progress(bar: Progress, n_done: int, n_more: float) -> None:
@@ -248,16 +248,14 @@ class _EnsembleOptions(NamedTuple):
         """Run a group of trajectories; ``report`` is called with the number of finished ones."""
 
         def run_with_engine(engine: str) -> None:
-            progress_counter, record.engine = ProgressCounter(report), engine
-            run = (
-                FixedEnsembleRun(record, progress_counter)
-                if record.control is None
-                else AdaptiveEnsembleRun(record, record.control, progress_counter)
-            )
+            record.engine = engine
+            run_class = FixedEnsembleRun if group.control is None else AdaptiveEnsembleRun
+            run = run_class(record, ProgressCounter(report))
             (run.run_compiled if engine == "compiled" else run.run_array)()
 
-        calls_python = record.events is not None and record.events.calls_python
-        is_worthwhile = not calls_python and is_worth_compiling(record.member, record.method)
+        group = record.group
+        calls_python = group.events is not None and group.events.calls_python
+        is_worthwhile = not calls_python and is_worth_compiling(group.member, group.method)
         prefers_compiled = self.engine == "auto" and is_worthwhile
         if self.engine == "compiled" or prefers_compiled:
             try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import contextlib
 import contextvars
 import functools
@@ -16,19 +17,11 @@ import numpy as np
 from ..disk import available_cores
 from ..engines import array_engine
 from ..engines.compiled.engine import CompiledBatch
-from ..engines.compiled.parameters import flat_parameters
-from ..engines.compiled.step_loop import cached_step_loop
-from ..engines.select_engine import MAX_COMPILED_DIM
 from ..engines.step import REPORTED_FIELDS
-from ..engines.step_control import StepControl
-from ..integrators import OneStepMethod
 from .driver import drive_fixed
+from .lanes import LANES_PER_BLOCK, LaneParameters, padded_member_indices
 from .record import GroupRecord
 from .schedule import CHUNK_STEPS, EngineCall
-from .system_family import Family
-
-LANES_PER_BLOCK = 8
-"""Number of trajectories in a block of the compiled engine: one AVX-512 vector, or two of AVX2."""
 
 THREAD_BATCH_SIZE = 8192
 """Largest number of trajectories that a thread of the compiled engine runs at once; enough to hide Python's
@@ -112,47 +105,8 @@ def _available_cores() -> int:
     return min(cores, MAX_THREADS.get() or cores)
 
 
-class LaneParameters:
-    """Compiled step loop of a family and a method, with the parameters of its trajectories."""
-
-    def __init__(self, family: Family, method: OneStepMethod, control: StepControl | None = None):
-        self.family, self.shared_parameters = family, flat_parameters(method, *([] if control is None else [control]))
-        self.first_lane_parameters = np.append(family.parameter_matrix(slice(0, 1), 1)[0], self.shared_parameters)
-        self.is_per_trajectory = np.append(family.is_per_trajectory, np.zeros(len(self.shared_parameters), dtype=bool))
-        self.step_loop = cached_step_loop(
-            family.form, self.first_lane_parameters, method, control, LANES_PER_BLOCK, self.is_per_trajectory
-        )
-
-    def start_batch(self, members: slice, x: np.ndarray) -> CompiledBatch:
-        """Return the batch of some members of the family, with steps of given sizes, from states x, shape (B, n)."""
-        return CompiledBatch(self.step_loop, self.first_lane_parameters, self.parameters(members, len(x)), x)
-
-    def parameters(self, members: slice, n_members: int) -> np.ndarray:
-        """Return the parameters that lanes read: of all members, shape (p,), if these agree, else (n_members, p)."""
-        if not self.is_per_trajectory.any():
-            return self.first_lane_parameters
-        return np.hstack(
-            [
-                self.family.parameter_matrix(members, n_members),
-                np.broadcast_to(self.shared_parameters, (n_members, len(self.shared_parameters))),
-            ]
-        )
-
-
-def padded_member_indices(start: int, stop: int, dim: int) -> np.ndarray:
-    """Return the indices from ``start`` to ``stop``, the last one repeated until they fill whole SIMD vectors.
-
-    A partly filled vector would round differently, so padding makes results independent of the number of trajectories.
-    States of large ``dim`` fill vectors by themselves.
-    """
-    n_padded = (
-        LANES_PER_BLOCK * math.ceil((stop - start) / LANES_PER_BLOCK) if dim <= MAX_COMPILED_DIM else stop - start
-    )
-    return np.minimum(np.arange(start, start + n_padded), stop - 1)
-
-
-class FixedEnsembleRun:
-    """Run of a group of trajectories of an ensemble with fixed steps.
+class EnsembleRun(abc.ABC):
+    """Run of a group of trajectories of an ensemble, on either engine.
 
     Parameters
     ----------
@@ -161,41 +115,56 @@ class FixedEnsembleRun:
     """
 
     def __init__(self, record: GroupRecord, progress_counter: ProgressCounter):
-        self.family, self.method, self.record, self.noise = record.family, record.method, record, record.noise
-        self.progress_counter, self._is_interrupted = progress_counter, False
+        self.record, self.group, self.progress_counter = record, record.group, progress_counter
+        self.is_interrupted, self._record_lock = False, threading.Lock()
 
     def run_compiled(self) -> None:
-        """Run all trajectories in blocks of lanes over threads; the compiled loop releases the interpreter's lock."""
-        lanes, x0, record_lock = LaneParameters(self.family, self.method), self.record.x0, threading.Lock()
-
-        def work(members: slice, stop: threading.Event) -> None:
-            n_members = members.stop - members.start
-            if not stop.is_set():
-                # NumPy releases the interpreter's lock in every operation; switching threads takes longer than these
-                with record_lock:
-                    batch = lanes.start_batch(members, x0[members])
-                max_steps = CHUNK_STEPS * 16 // max(n_members, LANES_PER_BLOCK)
-                calls = self.record.schedule.engine_calls(max_steps)
-                self._advance_to_end(batch, members, n_members, calls, stop.is_set, record_lock)
-
-        run_in_threads(work, len(x0), self.record.schedule.n_steps)
+        """Run all trajectories in SIMD lanes over threads; the compiled loop releases the interpreter's lock."""
+        group = self.group
+        lanes = LaneParameters(group.family, group.method, group.control)
+        max_steps = group.schedule.n_steps if group.control is None else math.inf
+        run_in_threads(functools.partial(self._run_lanes, lanes), len(group.x0), max_steps)
 
     def run_array(self) -> None:
-        """Run all trajectories on the array engine, a vmapped program per batch."""
-        n_trajectories, dim = self.record.x0.shape
-        batch_size = min(ARRAY_BATCH_SIZE, n_trajectories)
-        # bounded memory for increments and saved states
-        max_steps = CHUNK_STEPS if self.noise is None else max(1, CHUNK_STEPS * 16 // batch_size)
-        max_saves = max(1, min(array_engine.MAX_SAVES_PER_CALL, ARRAY_MAX_SAVED_VALUES // (batch_size * dim)))
-        for start in range(0, n_trajectories, batch_size):
-            n_members = min(batch_size, n_trajectories - start)
-            members = padded_member_indices(start, start + n_members, dim)
-            arguments = self.family.form, *self.family.vmap_arguments(members), self.method
-            batch = array_engine.ArrayBatch(*arguments, self.record.x0[members])
-            calls = self.record.schedule.engine_calls(max_steps, max_saves)
-            self._advance_to_end(batch, members, n_members, calls, lambda: False, contextlib.nullcontext())
-            if self._is_interrupted:
+        """Run all trajectories on the array engine, one vmapped program per batch."""
+        n_trajectories, dim = self.group.x0.shape
+        for start in range(0, n_trajectories, ARRAY_BATCH_SIZE):
+            n_members = min(ARRAY_BATCH_SIZE, n_trajectories - start)
+            self._run_batch(padded_member_indices(start, start + n_members, dim), n_members)
+            if self.is_interrupted:
                 return
+
+    @abc.abstractmethod
+    def _run_lanes(self, lanes: LaneParameters, members: slice, stop: threading.Event) -> None:
+        """Run some trajectories in lanes, until the user sets the event ``stop``."""
+
+    @abc.abstractmethod
+    def _run_batch(self, members: np.ndarray, n_members: int) -> None:
+        """Run trajectories, the first ``n_members`` of these and copies of the last; Ctrl-C sets ``is_interrupted``."""
+
+
+class FixedEnsembleRun(EnsembleRun):
+    """Run of a group of trajectories of an ensemble with fixed steps."""
+
+    def _run_lanes(self, lanes: LaneParameters, members: slice, stop: threading.Event) -> None:
+        n_members = members.stop - members.start
+        if not stop.is_set():
+            # NumPy releases the interpreter's lock in every operation; switching threads takes longer than these
+            with self._record_lock:
+                batch = lanes.start_batch(members, self.group.x0[members])
+            calls = self.group.schedule.engine_calls(CHUNK_STEPS * 16 // max(n_members, LANES_PER_BLOCK))
+            self._advance_to_end(batch, members, n_members, calls, stop.is_set)
+
+    def _run_batch(self, members: np.ndarray, n_members: int) -> None:
+        group, dim = self.group, self.group.x0.shape[1]
+        batch_size = min(ARRAY_BATCH_SIZE, len(group.x0))
+        # bounded memory for increments and saved states
+        max_steps = CHUNK_STEPS if group.noise is None else max(1, CHUNK_STEPS * 16 // batch_size)
+        max_saves = max(1, min(array_engine.MAX_SAVES_PER_CALL, ARRAY_MAX_SAVED_VALUES // (batch_size * dim)))
+        arguments = group.family.form, *group.family.vmap_arguments(members), group.method
+        batch = array_engine.ArrayBatch(*arguments, group.x0[members])
+        calls = group.schedule.engine_calls(max_steps, max_saves)
+        self._advance_to_end(batch, members, n_members, calls, lambda: False)
 
     def _advance_to_end(
         self,
@@ -204,54 +173,25 @@ class FixedEnsembleRun:
         n_members: int,
         calls: Iterator[EngineCall],
         is_stopped: Callable[[], bool],
-        record_lock: contextlib.AbstractContextManager,
     ) -> None:
         """Advance the trajectories with these member indices by the calls of a schedule, and fill the record."""
-        record, first_save = self.record, 1
+        record, group, first_save = self.record, self.group, 1
 
         def record_call(call: EngineCall, first_step: int, states: np.ndarray) -> bool:
             nonlocal first_save
             if call.keep:
                 record.store_states(members, first_save, states)
                 first_save += call.n_saves
-            self.progress_counter.add(n_members * call.n_saves * call.steps_per_save / record.schedule.n_steps)
+            self.progress_counter.add(n_members * call.n_saves * call.steps_per_save / group.schedule.n_steps)
             return not is_stopped()
 
-        with record_lock:
+        with self._record_lock:
             initial = batch.read(RECORDED_INITIAL_FIELDS)
             record.record_initial(members, initial["x"], initial["energy"], initial["entropy"])
-        noise = None if self.noise is None else functools.partial(self.noise.step_increments, members)
+        noise = None if group.noise is None else functools.partial(group.noise.step_increments, members)
         try:
             drive_fixed(batch, calls, record_call, noise)
         except KeyboardInterrupt:
-            self._is_interrupted = True
-        with record_lock:
+            self.is_interrupted = True
+        with self._record_lock:
             record.finish_fixed_step_members(members, initial, batch.read(REPORTED_FIELDS))
-
-
-REPLAY_STEPS_PER_CALL = 32
-"""Largest number of steps that one call of the array engine replays."""
-
-
-def replay_steps(
-    engine: str, family: Family, method: OneStepMethod, x: np.ndarray, h: np.ndarray, steps: int = 1
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Take ``steps`` steps of size h[i] with each member i of a small family, on an engine, "compiled" or "array".
-
-    Returns
-    -------
-    dict of arrays
-        Engine fields after the steps.
-    array, shape (trajectories, steps, n)
-        States after each step.
-    """
-    batch: CompiledBatch | array_engine.ArrayBatch
-    if engine == "compiled":
-        batch, steps_per_call = LaneParameters(family, method).start_batch(slice(0, len(x)), x), max(1, steps)
-    else:
-        arguments = family.form, *family.vmap_arguments(slice(None)), method
-        batch = array_engine.ArrayBatch(*arguments, x, min_capacity=REPLAY_STEPS_PER_CALL)
-        steps_per_call = REPLAY_STEPS_PER_CALL
-    counts = [min(steps_per_call, steps - n_done) for n_done in range(0, steps, steps_per_call)]
-    states = [batch.advance(h, n_saves, 1)[..., :-2] for n_saves in counts]
-    return batch.read(), np.concatenate(states, axis=1)

@@ -18,7 +18,7 @@ from ..dissipation.checks import NEGATIVE_RATE_MESSAGE
 from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
 from ..errors import InputError
 from ..functions.bath_energy import BathEnergy
-from ..functions.conditions import refusal_message, require_condition
+from ..functions.conditions import condition_message, require_condition
 from ..functions.energy import Quadratic
 from ..models.inertia import inverse_moments
 from ..systems import System
@@ -152,7 +152,7 @@ def refused_members(system: System, arrays: Sequence[np.ndarray]) -> dict[int, s
     for i, condition in conditions_by_leaf(system).items():
         is_refused = ~np.asarray(condition.test(arrays[i])) & ~np.isnan(arrays[i])
         for member in np.flatnonzero(is_refused.reshape(len(arrays[i]), -1).any(axis=1)):
-            reasons[int(member)] = refusal_message(condition.template, arrays[i][member])
+            reasons[int(member)] = condition_message(condition.template, arrays[i][member])
     return reasons
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -14,46 +14,31 @@ from ..engines.select_engine import EngineWithFallback
 from ..engines.status_codes import StatusCode
 from ..engines.step import energy_or_entropy_that_relaxes
 from ..engines.step_control import StepControl
-from ..integrators.fluctuating import noise_dimension
-from ..results.audit_evidence import (
-    MAX_LOCAL_ERROR_STEPS,
-    MAX_SENSITIVITY_STATES,
-    MIN_MOTION_FRACTION,
-    MIN_RELATIVE_MOTION,
-    SMALLEST_NORMAL,
-    Evidence,
-    column_maxima,
-    evenly_spaced_indices,
-    largest_and_evenly_spaced,
-    largest_drifts,
-    merge_evidence,
-    n_replayed_steps,
-    rounding_scales,
-    select_worst_steps,
-)
+from ..integrators import OneStepMethod
+from ..results.audit_evidence import merge_evidence
 from ..results.ensemble import Ensemble
 from ..results.events import Events
-from ..results.rounding_scale import InvariantDrift, RoundingScale
+from ..results.rounding_scale import RoundingScale
 from ..results.solution import Solution
 from ..results.status import Laws
-from ..results.step_sampling import MAX_SAMPLED_VALUES, REPLAY_COST_RATIO, StepSample
+from ..results.step_sampling import vector_field
 from ..systems import System
-from ..systems.conditions import RunCondition, worst_conditions
 from ..systems.states import reshape_to_sites
-from ..tracing.interpret import evaluate_at_points
 from .events import EventSet, collect_events
+from .evidence import (
+    MAX_LOCAL_ERROR_STEPS,
+    MAX_SENSITIVITY_STATES,
+    GroupEvidence,
+    LaneReplay,
+    evenly_spaced_indices,
+    largest_and_evenly_spaced,
+)
 from .noise import NoisePaths
 from .preparation import invariants_and_laws
 from .problem import Problem
 from .schedule import StepSchedule
-from .solution_builder import (
-    EngineReplay,
-    RecordedFunctions,
-    build_solution,
-    series_of_functions,
-    velocities_at_states,
-)
-from .system_family import Family, member_rounding_scales, vector_fields_of_members
+from .solution_builder import RecordedFunctions, build_solution, velocities_at_states
+from .system_family import Family
 from .termination import ensemble_failure_message
 
 RECORDED_QUANTITIES = (
@@ -65,9 +50,6 @@ RECORDED_QUANTITIES = (
 
 FAILURE_CODES = (StatusCode.NOT_CONVERGED, StatusCode.NON_FINITE, StatusCode.STEP_UNDERFLOW, StatusCode.STEP_LIMIT)
 """Status codes of failed trajectories."""
-
-MAX_REPLAYED_STEPS = 256
-"""Largest number of steps of a trajectory that an audit replays on the array engine, whose steps are slow."""
 
 MAX_EXPLAINED_FAILURES = 1_000
 """Largest number of failed trajectories that are checked for unbounded growth."""
@@ -112,6 +94,11 @@ class TrajectoryGroup(NamedTuple):
     events: EventSet | None
     noise: NoisePaths | None
 
+    @property
+    def method(self) -> OneStepMethod:
+        """The method of all trajectories."""
+        return self.problem.method
+
 
 class EnsembleRecord:
     """Outcomes and saved states of all trajectories of an ensemble, filled in group by group.
@@ -154,15 +141,11 @@ class EnsembleRecord:
         self.events: list[EventOccurrence] = []
         self.groups = [GroupRecord(self, group) for group in groups]
 
-    def to_ensemble(
-        self, replay: Callable, reasons: Mapping[int, str], provenance: Mapping[str, Any], **fields: Any
-    ) -> Ensemble:
+    def to_ensemble(self, reasons: Mapping[int, str], provenance: Mapping[str, Any], **fields: Any) -> Ensemble:
         """Return the recorded trajectories as an :class:`Ensemble`, with further fields of it.
 
         Parameters
         ----------
-        replay : function of (engine, family, method, x, h, steps)
-            As :func:`.ensemble_lanes.replay_steps`.
         reasons : mapping from int to str
             Why trajectories are inadmissible.
         provenance : mapping
@@ -188,7 +171,8 @@ class EnsembleRecord:
             if self.trajectories is not None:
                 work = np.asarray(self.clock.work(x))
             x, x0, energy = None if x is None else x[..., :-2], x0[..., :-2], energy + work
-        engine, events = " and ".join(sorted({group.engine for group in self.groups} - {""})), self.groups[0].events
+        events, sources = self.groups[0].group.events, [part.evidence_source() for part in self.groups]
+        engine = " and ".join(sorted({part.engine for part in self.groups} - {""}))
         result = Ensemble(
             t=t,
             x=x,
@@ -202,27 +186,18 @@ class EnsembleRecord:
             attitude=attitude,
             attitude0=attitude0,
             work=work,
-            laws=common_laws([group.problem.laws for group in self.groups]),
+            laws=common_laws([part.group.problem.laws for part in self.groups]),
             engine=engine,
             events=Events() if events is None else collect_events(self.member, events.names, self.events),
             reasons={**reasons, **self.failure_reasons},
             provenance={**provenance, "engine": engine},
-            evidence_source=self._evidence_source(replay),
+            evidence_source=functools.cache(lambda: merge_evidence([source() for source in sources])),
             velocity_sources=self._velocity_getters_by_name(),
             solution_builder=self._build_solution,
             **quantities,
             **fields,
         )
         return reshape_to_sites(self.member, result)
-
-    def _evidence_source(self, replay: Callable) -> Callable[[], Evidence] | None:
-        """Return the function that computes the evidence for an audit, or None: short steps with noise show only it."""
-        if noise_dimension(self.groups[0].method):
-            return None
-        collectors = [
-            EnsembleEvidenceCollector(group, functools.partial(replay, group.engine)) for group in self.groups
-        ]
-        return lambda: merge_evidence([collect() for collect in collectors])
 
     def _velocity_getters_by_name(self) -> dict[str, Callable[[], np.ndarray]]:
         """Return functions that compute the velocities of all trajectories, by the names of the velocities."""
@@ -231,16 +206,15 @@ class EnsembleRecord:
         return {name: functools.partial(self._velocities, name) for name in self.member.motion_quantities.velocities}
 
     def _velocities(self, name: str) -> np.ndarray:
-        parts = [group.velocities(name) for group in self.groups]
-        values = np.full((len(self.status), *parts[0].shape[1:]), np.nan)
-        for group, part in zip(self.groups, parts, strict=True):
-            values[group.numbers] = part
+        velocities, numbers = zip(*((part.velocities(name), part.numbers) for part in self.groups), strict=True)
+        values = np.full((len(self.status), *velocities[0].shape[1:]), np.nan)
+        values[np.concatenate(numbers)] = np.concatenate(velocities)
         return values
 
     def _build_solution(self, ensemble: Ensemble, i: int) -> Solution:
         """Return the solution of a trajectory, as a single run would present it."""
-        group = next(group for group in self.groups if i in group.numbers)
-        return group.build_solution(ensemble.member_solution(i), int(np.searchsorted(group.numbers, i)))
+        part = next(part for part in self.groups if i in part.numbers)
+        return part.build_solution(ensemble.member_solution(i), int(np.searchsorted(part.numbers, i)))
 
 
 class GroupRecord:
@@ -260,15 +234,12 @@ class GroupRecord:
     """
 
     def __init__(self, record: EnsembleRecord, group: TrajectoryGroup):
-        self.numbers, self.problem, self.family, self.member, self.x0, self.schedule, self.h = group[:7]
-        self.method = self.problem.method
-        self.control, self.events, self.noise = group[7:]
-        self.record, self.engine = record, ""
+        self.record, self.group, self.numbers, self.engine = record, group, group.numbers, ""
         self._is_all = len(self.numbers) == len(record.status)
         rows = self._rows(slice(None))
         record.status[rows] = StatusCode.INTERRUPTED
-        record.quantities["first_step"][rows] = self.schedule.longest_steps[0]
-        record.quantities["end_time"][rows] = self.schedule.start
+        record.quantities["first_step"][rows] = group.schedule.longest_steps[0]
+        record.quantities["end_time"][rows] = group.schedule.start
 
     def _rows(self, members: MemberSelection) -> MemberSelection:
         """Return the rows of the record for the trajectories with these indices in the group."""
@@ -320,12 +291,12 @@ class GroupRecord:
         initial, final : mapping of arrays
             Fields of :class:`liethermo.engines.step.State`.
         """
-        steps = final["step"].astype(np.int64)
-        is_unfinished = (final["status"] == StatusCode.COMPLETED) & (steps < self.schedule.n_steps)
+        steps, schedule = final["step"].astype(np.int64), self.group.schedule
+        is_unfinished = (final["status"] == StatusCode.COMPLETED) & (steps < schedule.n_steps)
         status = np.where(is_unfinished, StatusCode.INTERRUPTED, final["status"])
-        self.finish_members(members, initial, final, status, self.schedule.times_after(steps))
+        self.finish_members(members, initial, final, status, schedule.times_after(steps))
         if self.record.trajectories is not None:
-            counts, rows = self.schedule.saved_step_counts, self._rows(members)
+            counts, rows = schedule.saved_step_counts, self._rows(members)
             is_after_end = np.arange(len(counts)) >= np.searchsorted(counts, steps, side="right")[:, None]
             trajectories = self.record.trajectories
             trajectories[rows] = np.where(is_after_end[..., None], np.nan, trajectories[rows])
@@ -341,7 +312,7 @@ class GroupRecord:
         n_rejected: np.ndarray | None = None,
     ) -> None:
         """Record the outcome of trajectories: status, end time, final state and the quantities of the audit."""
-        record, rows = self.record, self._rows(members)
+        record, group, rows = self.record, self.group, self._rows(members)
         quantities, energy, initial_energy = record.quantities, final["energy"], initial["energy"]
         quantities["energy"][rows], quantities["entropy"][rows] = energy, final["entropy"]
         drift = np.maximum(final["largest_energy"] - initial_energy, initial_energy - final["smallest_energy"])
@@ -356,11 +327,12 @@ class GroupRecord:
         quantities["residual"][rows] = final["residual"]
         quantities["end_time"][rows] = end_time
         start, end = (
-            np.asarray(energy_or_entropy_that_relaxes(self.member, f["energy"], f["entropy"])) for f in (initial, final)
+            np.asarray(energy_or_entropy_that_relaxes(group.member, f["energy"], f["entropy"]))
+            for f in (initial, final)
         )
         change = np.where(np.abs(end - start) > 1e-12 * np.abs(end), end - start, np.nan)
         quantities["relaxation_time"][rows] = (
-            end * (end_time - self.schedule.start) - final["relaxation_integral"]
+            end * (end_time - group.schedule.start) - final["relaxation_integral"]
         ) / change
         record.status[rows], record.steps[rows] = status, final["step"]
         record.iterations[rows] = final["fixed_point_iterations"] + final["newton_iterations"]
@@ -382,15 +354,49 @@ class GroupRecord:
         ]
         if not len(failed_rows):
             return
-        member_indices = np.arange(len(self.x0))[members][failed_rows]
-        parameters = self.family.select(member_indices).parameter_matrix(slice(None), len(member_indices))
-        velocities = vector_fields_of_members(
-            (self.family.form, parameters.shape[1]), np.concatenate([parameters, x[failed_rows]], axis=1)
-        )
+        group = self.group
+        member_indices = np.arange(len(group.x0))[members][failed_rows]
+        with np.errstate(all="ignore"):
+            velocities = np.asarray(group.family.evaluate(vector_field, member_indices, x[failed_rows]))
         for i, j, velocity in zip(failed_rows, member_indices, velocities, strict=True):
             t = float(end_time[i])
-            if text := ensemble_failure_message(x[i], self.x0[j], velocity, t - self.schedule.start, t, self.h):
+            if text := ensemble_failure_message(x[i], group.x0[j], velocity, t - group.schedule.start, t, group.h):
                 self.record.failure_reasons[int(self.numbers[j])] = text
+
+    def evidence_source(self) -> GroupEvidence:
+        """Return the function that computes the evidence for an audit, of a sample of the trajectories.
+
+        Half of them are those that took most iterations, half are evenly spaced.
+        """
+        record, group = self.record, self.group
+        n_steps = record.steps[self.numbers]
+        sample = largest_and_evenly_spaced(record.iterations[self.numbers] / np.fmax(n_steps, 1), MAX_LOCAL_ERROR_STEPS)
+        n_equal_steps = 1 if np.isnan(group.h) else group.schedule.segments[0].n_full_steps
+        return GroupEvidence(
+            group.member,
+            LaneReplay(self.engine, group.family.select(sample), group.method),
+            np.ascontiguousarray(group.x0[sample]),
+            group.schedule.start,
+            self.quantity("first_step", sample),
+            np.fmin(n_steps[sample], max(1, n_equal_steps)),
+            self.quantity("distance", sample),
+            *self.sampled_states(sample),
+        )
+
+    def sampled_states(self, sample: np.ndarray) -> tuple[Sequence[np.ndarray] | np.ndarray, np.ndarray]:
+        """Return saved states of these trajectories, shape (sample, times, n), at times spread over the run.
+
+        Both are empty if the run keeps no states.
+        """
+        record, rows = self.record, self.numbers[sample]
+        if record.trajectories is not None:
+            times = evenly_spaced_indices(record.trajectories.shape[1], MAX_SENSITIVITY_STATES)
+            return record.trajectories[rows][:, times, :-2], record.saved_times[times]
+        if record.x is None:
+            return (), np.zeros(0)
+        states = np.stack([record.x0[rows], record.x[rows]], axis=1)
+        end = np.nanmax(record.quantities["end_time"])
+        return states, np.linspace(record.start, end, MAX_SENSITIVITY_STATES)
 
     def velocities(self, name: str) -> np.ndarray:
         """Return the velocities of a name at the recorded states of the group, trajectories first."""
@@ -400,26 +406,27 @@ class GroupRecord:
             states = x[rows]
         else:
             states = trajectories[rows, ..., :-2]
-        if not any(self.family.has_member_axis):
-            return velocities_at_states(name, self.member, states)
-        return np.stack([velocities_at_states(name, self.family.member(i), x) for i, x in enumerate(states)])
+        family = self.group.family
+        if not any(family.has_member_axis):
+            return velocities_at_states(name, self.group.member, states)
+        return np.stack([velocities_at_states(name, family.member(i), x) for i, x in enumerate(states)])
 
     def build_solution(self, member_solution: Solution, j: int) -> Solution:
         """Return the solution of trajectory j of the group, as a single run would present it.
 
         ``member_solution`` is the one that the ensemble has, without conserved functions.
         """
-        system, row, record = self.family.member(j), int(self.numbers[j]), self.record
+        method, system, row, record = self.group.method, self.group.family.member(j), int(self.numbers[j]), self.record
         if record.trajectories is None:
             assert record.x is not None
-            x = np.stack([self.x0[j], record.x[row]])
+            x = np.stack([self.group.x0[j], record.x[row]])
         else:
             x = record.trajectories[row, : len(member_solution.t), :-2]
         steps = np.minimum(np.diff(member_solution.t), record.quantities["first_step"][row])
-        invariants, laws = invariants_and_laws(system, self.method)
+        invariants, laws = invariants_and_laws(system, method)
         solution = build_solution(
             system,
-            self.method,
+            method,
             x,
             laws=laws,
             functions=RecordedFunctions.from_system(system, invariants),
@@ -427,7 +434,7 @@ class GroupRecord:
             energy=member_solution.energy_balance,
             entropy=member_solution.entropy,
             step_sizes=lambda: steps,
-            replay=EngineReplay(EngineWithFallback(system, self.method, "auto", 1)),
+            engine=EngineWithFallback(system, method, "auto", 1),
             status=member_solution.status,
             stats=member_solution.stats,
             provenance=member_solution.provenance,
@@ -436,148 +443,6 @@ class GroupRecord:
         )
         inertia = None if system.inertia is None else system.inertia.tolist()
         return replace(solution, provenance={**member_solution.provenance, "inertia": inertia})
-
-
-class EnsembleEvidenceCollector:
-    """Computes local errors and rounding scales of an ensemble when it is called.
-
-    A sample of trajectories is replayed from the start: half of them are those that took most iterations, half are
-    evenly spaced. Their worst steps are compared with substeps.
-
-    Parameters
-    ----------
-    group : GroupRecord
-    replay : function of (family, method, x, h, steps)
-        :func:`.ensemble_lanes.replay_steps` on an engine.
-    """
-
-    def __init__(self, group: GroupRecord, replay: Callable):
-        schedule, n_steps = group.schedule, group.record.steps[group.numbers]
-        effort = group.record.iterations[group.numbers] / np.fmax(n_steps, 1)
-        sample = largest_and_evenly_spaced(effort, MAX_LOCAL_ERROR_STEPS)
-        self.family, self.member, self.method = group.family.select(sample), group.member, group.method
-        self.x, self.distance = np.ascontiguousarray(group.x0[sample]), group.quantity("distance", sample)
-        self.h, self.start_time, self.replay = group.quantity("first_step", sample), schedule.start, replay
-        self.n_steps_taken = n_steps[sample]
-        self.saved_states, self.saved_times = _sampled_saved_states(group.record, group.numbers[sample])
-        n_equal_steps = 1 if np.isnan(group.h) else schedule.segments[0].n_full_steps
-        if group.engine != "compiled":
-            n_equal_steps = min(n_equal_steps, MAX_REPLAYED_STEPS)
-        self.max_replayed_steps = max(1, min(n_equal_steps, MAX_SAMPLED_VALUES // (REPLAY_COST_RATIO * self.x.size)))
-
-    @np.errstate(over="ignore", invalid="ignore")  # overflowed states have the status non_finite
-    def __call__(self) -> Evidence:
-        form, n_members = self.family.form, len(self.x)
-        parameters = self.family.parameter_matrix(slice(None), n_members)
-        evidence = Evidence(
-            terms=self._rounding_scales(parameters), conditions=self._conditions(), drifts=self._drifts()
-        )
-        final, states = self.replay(self.family, self.method, self.x, self.h, self.max_replayed_steps)
-        member_of_step, step_number = np.nonzero(
-            np.arange(self.max_replayed_steps) < np.fmin(final["step"], self.n_steps_taken)[:, None]
-        )
-        if not len(member_of_step):
-            return evidence
-        path = np.concatenate([self.x[:, None], states], axis=1)
-        steps = StepSample(
-            self.start_time + step_number * self.h[member_of_step],
-            self.h[member_of_step],
-            path[member_of_step, step_number],
-            path[member_of_step, step_number + 1],
-        )
-        model, min_motion = (form, parameters.shape[1]), MIN_MOTION_FRACTION * self.distance
-
-        def field(step_indices: np.ndarray, x: np.ndarray) -> np.ndarray:
-            step_parameters = np.broadcast_to(
-                parameters[member_of_step[step_indices], None], (*x.shape[:2], parameters.shape[1])
-            )
-            rows = np.concatenate([step_parameters, x], axis=2).reshape(-1, parameters.shape[1] + x.shape[2])
-            return vector_fields_of_members(model, rows).reshape(x.shape)
-
-        worst_indices, defect = select_worst_steps(
-            steps, field, min_motion[member_of_step], n_replayed_steps(self.x.shape[1])
-        )
-        members, x, h = (
-            self.family.select(member_of_step[worst_indices]),
-            steps.x[worst_indices],
-            steps.h[worst_indices],
-        )
-        n_substeps = n_replayed_steps(self.x.shape[1])
-        (single_step, _), (substeps, _) = (self.replay(members, self.method, x, h / m, m) for m in (1, n_substeps))
-        ends = [self._user_states(after["x"] + after["compensation"]) for after in (single_step, substeps)]
-        start = self._user_states(x)
-        motion = np.abs(ends[0] - start).max(axis=1)
-        is_known = (single_step["status"] == 0) & (substeps["status"] == 0)
-        is_moving = ~is_known | (motion > MIN_RELATIVE_MOTION * np.abs(start).max(axis=1))
-        if not is_moving.any():
-            return evidence
-        errors = np.abs(ends[1] - ends[0]).max(axis=1) / np.fmax(
-            np.fmax(motion, min_motion[member_of_step[worst_indices]]), SMALLEST_NORMAL
-        )
-        errors = np.where(is_moving, np.where(is_known, errors, defect), 0.0)
-        max_index = int(np.argmax(errors))
-        return replace(
-            evidence,
-            local_error=float(errors[max_index]),
-            error_time=float(steps.t[worst_indices[max_index]]),
-            looked=len(steps.h),
-        )
-
-    def _conditions(self) -> tuple[RunCondition, ...]:
-        """Return the conditions beside the laws, each of the trajectory of the sample where it is worst."""
-        guarantees = frozenset(self.method.preserves)
-        return worst_conditions(
-            self.family.member(i).run_conditions(states, self.saved_times, guarantees)
-            for i, states in enumerate(self._known_states())
-        )
-
-    def _drifts(self) -> dict[str, InvariantDrift]:
-        """Return the drifts of what the method promises to keep, each of the trajectory where it is worst."""
-        return largest_drifts(self._member_drifts(i, states) for i, states in enumerate(self._known_states()))
-
-    def _member_drifts(self, i: int, states: np.ndarray) -> dict[str, InvariantDrift]:
-        recorded, laws = invariants_and_laws(self.family.member(i), self.method)
-        functions = {name: function for name, (function, _) in recorded.items() if name in laws.conserved}
-        if not functions or not len(states):
-            return {}
-        scales = map(column_maxima, evaluate_at_points(rounding_scales, tuple(functions.values()), states))
-        columns = zip(series_of_functions(functions, states).items(), *scales, strict=True)
-        return {name: InvariantDrift.from_series(values, *maxima) for (name, values), *maxima in columns}
-
-    def _known_states(self) -> Iterator[np.ndarray]:
-        """Return the saved states of each trajectory of the sample up to its end; nothing if none were kept."""
-        return (states[np.isfinite(states).all(axis=1)] for states in self.saved_states)
-
-    def _rounding_scales(self, parameters: np.ndarray) -> dict[str, float]:
-        """Return the sizes that set the rounding errors of energy and entropy, each the largest over the sample."""
-        rows = np.concatenate([parameters, self.x], axis=1)
-        max_scales = evaluate_at_points(member_rounding_scales, (self.family.form, parameters.shape[1]), rows).max(
-            axis=0
-        )
-        return {
-            name: float(scale) for name, scale in zip(("energy", "entropy"), np.nan_to_num(max_scales), strict=False)
-        }
-
-    def _user_states(self, x: np.ndarray) -> np.ndarray:
-        return np.asarray(self.member.points(x)).reshape(len(x), -1)
-
-
-def _sampled_saved_states(
-    record: EnsembleRecord, sample: np.ndarray
-) -> tuple[Sequence[np.ndarray] | np.ndarray, np.ndarray]:
-    """Return saved states of the trajectories with these indices, shape (sample, times, n), at times spread over the
-    run.
-
-    Both are empty if the run keeps no states.
-    """
-    if record.trajectories is None:
-        if record.x is None:
-            return (), np.zeros(0)
-        states = np.stack([record.x0[sample], record.x[sample]], axis=1)
-        end = np.nanmax(record.quantities["end_time"])
-        return states, np.linspace(record.start, end, MAX_SENSITIVITY_STATES)
-    times = evenly_spaced_indices(record.trajectories.shape[1], MAX_SENSITIVITY_STATES)
-    return record.trajectories[sample][:, times, :-2], record.saved_times[times]
 
 
 def common_laws(laws_of_groups: Sequence[Laws]) -> Laws:

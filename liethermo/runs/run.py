@@ -34,7 +34,7 @@ from .events import EventSet, collect_events
 from .noise import NoisePaths
 from .problem import Problem
 from .schedule import EngineCall, StepSchedule
-from .solution_builder import EngineReplay, build_solution, run_provenance
+from .solution_builder import build_solution, run_provenance
 from .termination import (
     INTERRUPTING_ERRORS,
     adaptive_failure_status,
@@ -275,7 +275,7 @@ class Run:
             energy=energy,
             entropy=entropy,
             step_sizes=functools.partial(_longest_steps, self.schedule, self.taken_steps, len(x) - 1),
-            replay=EngineReplay(self.engine),
+            engine=self.engine,
             laws=self.problem.laws,
             functions=self.problem.functions,
             status=self.status or Status(StatusCode.INTERRUPTED, "still running", len(x) - 1, self.last_saved_time),

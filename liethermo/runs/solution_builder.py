@@ -11,19 +11,17 @@ from importlib import metadata
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ..dissipation.base import dissipation_name
 from ..engines.select_engine import EngineWithFallback
-from ..engines.status_codes import StatusCode
 from ..functions.energy import Energy
-from ..results.audit_evidence import EvidenceCollector, StepReplay
 from ..results.solution import Solution, defer
 from ..results.status import Laws
 from ..systems import System
 from ..tracing.interpret import evaluate_at_points
 from .adaptive import Adaptive
+from .evidence import EngineReplay, RunEvidence, series_of_functions
 
 
 class RecordedFunctions(NamedTuple):
@@ -62,7 +60,7 @@ def build_solution(
     x: np.ndarray,
     entropy: np.ndarray | None,
     step_sizes: Callable[[], np.ndarray],
-    replay: StepReplay,
+    engine: EngineWithFallback,
     laws: Laws,
     functions: RecordedFunctions,
     **fields,
@@ -73,7 +71,8 @@ def build_solution(
     ----------
     step_sizes : function without arguments to an array, shape (times - 1,)
         Size of a step that the run took after each state.
-    replay : StepReplay
+    engine : EngineWithFallback
+        The engine of the run.
     laws : Laws
     functions : RecordedFunctions
     **fields
@@ -84,8 +83,8 @@ def build_solution(
         entropy=None if system.entropy is None else entropy,
         casimirs=defer(functools.partial(series_of_functions, functions.of_series, x)),
         laws=laws,
-        evidence_source=EvidenceCollector(
-            system, method, functions.invariants, x, np.asarray(fields["t"]), step_sizes, replay
+        evidence_source=RunEvidence(
+            system, method, functions.invariants, x, np.asarray(fields["t"]), step_sizes, EngineReplay(engine)
         ),
         velocity_sources={
             name: functools.partial(velocities_at_states, name, system, x) for name in functions.velocity_names
@@ -104,34 +103,6 @@ def velocities_at_states(name: str, system: System, x: np.ndarray) -> np.ndarray
 def _velocities(system: System, x) -> dict[str, Any]:
     """Return the velocities at a state, shape (n,), by their names, shape (k,) each."""
     return {name: velocity(x) for name, velocity in system.motion_quantities.velocities.items()}
-
-
-def series_of_functions(functions: Mapping[str, Energy], x: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the values of functions at states, shape (m, n), by their names, shape (m,) each."""
-    return {name: evaluate_at_points(_function_value, function, x) for name, function in functions.items()}
-
-
-def _function_value(function, x):
-    return function.value(x)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class EngineReplay:
-    """Replays steps from any state with the compiled program of a run: a :class:`StepReplay`."""
-
-    engine: EngineWithFallback
-
-    def __call__(self, x: np.ndarray, h: float, steps: int = 1):
-        return self.engine.advance(self.engine.initial_run_state(jnp.asarray(x)), h, 1, steps)[0]
-
-    def states_after_steps(self, x: np.ndarray, h: float, steps: int) -> np.ndarray:
-        state, chunks = self.engine.initial_run_state(jnp.asarray(x)), [np.empty((0, len(x)))]
-        while steps > 0 and int(state.status) == StatusCode.COMPLETED:
-            n_saves = min(steps, self.engine.max_saves_per_call)
-            state, (states, _, _, is_reached) = self.engine.advance(state, h, n_saves, 1)
-            chunks.append(np.asarray(states)[:n_saves][np.asarray(is_reached)[:n_saves].astype(bool)])
-            steps -= n_saves
-        return np.concatenate(chunks)
 
 
 def run_provenance(

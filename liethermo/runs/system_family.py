@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -16,7 +17,6 @@ from manifolds import ManifoldsError
 from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
 from ..errors import InputError, LiethermoError
 from ..models.inertia import are_inertia_tensors
-from ..results.audit_evidence import energy_and_entropy, rounding_scales
 from ..systems import System
 from ..systems.kinds import require_system
 from ..tracing.caching import fingerprint
@@ -321,6 +321,20 @@ class Family:
         columns = [np.broadcast_to(row.reshape(len(row), -1), (n_members, row[0].size)) for row in rows]
         return np.concatenate([np.zeros((n_members, 0)), *columns], axis=1)
 
+    def evaluate(self, function: Callable, members: slice | np.ndarray, x: np.ndarray) -> Any:
+        """Return ``function(member, x)`` for each of the selected members at its own state, with members first.
+
+        Parameters
+        ----------
+        function : function from a System and an array, shape (n,), to a pytree of float64 arrays
+            It must not be a closure made anew for each call, because compiled versions are cached by its identity.
+        members : slice, or array of int, shape (m,)
+        x : array, shape (m, n)
+        """
+        parameters = self.parameter_matrix(members, len(x))
+        rows = np.concatenate([parameters, x], axis=1)
+        return evaluate_at_points(_function_of_row(function), (self.form, parameters.shape[1]), rows)
+
     def vmap_arguments(self, members: slice | np.ndarray) -> tuple[list[jax.Array], list[Any]]:
         """Return the parameter arrays of the selected members, and their axes for ``jax.vmap``."""
         arrays = [
@@ -350,18 +364,15 @@ def error_message_of(call: Callable[[], Any]) -> str:
     return ""
 
 
-def member_rounding_scales(model: tuple[ProgramStructure, int], row) -> jax.Array:
-    """Return the rounding scales of energy and entropy, from a row of p parameters and a state."""
-    form, p = model
-    return rounding_scales(energy_and_entropy(form.build(row[:p])), row[p:])[1]
+@functools.cache
+def _function_of_row(function: Callable) -> Callable:
+    """Return the function of a program structure, and of a row of p parameters and a state.
 
+    It is one for each ``function``, because compiled versions are cached by its identity.
+    """
 
-def vector_fields_of_members(model: tuple[ProgramStructure, int], rows: np.ndarray) -> np.ndarray:
-    """Return vector fields, shape (m, n), from rows of p parameters and a state, shape (m, p + n)."""
-    with np.errstate(all="ignore"):
-        return np.asarray(evaluate_at_points(_member_vector_field, model, rows))
+    def evaluate_row(model: tuple[ProgramStructure, int], row):
+        form, p = model
+        return function(form.build(row[:p]), row[p:])
 
-
-def _member_vector_field(model: tuple[ProgramStructure, int], row):
-    form, p = model
-    return form.build(row[:p]).vector_field(row[p:])
+    return evaluate_row

@@ -12,12 +12,11 @@ import numpy as np
 from ..engines.status_codes import RESULT_CODES, StatusCode
 from ..integrators import OneStepMethod
 from ..results.audit import Tolerances, check_laws
-from ..results.audit_evidence import energy_and_entropy, rounding_scales
 from ..results.ensemble import Ensemble
 from ..results.status import Laws
 from ..runs.ensemble import ensemble
+from ..runs.evidence import energy_and_entropy_rounding_scales
 from ..runs.noise import Fluctuations
-from ..runs.system_family import member_rounding_scales
 from ..systems import System
 from ..systems.rotations import attitude_array
 from ..tracing.caching import LRUCache
@@ -334,12 +333,9 @@ class PointSolver:
         if self.systems.example_system.energy.depends_on_time:
             return {}
         if isinstance(family, System):
-            magnitudes = evaluate_at_points(_system_rounding_scales, family, x)
+            magnitudes = evaluate_at_points(energy_and_entropy_rounding_scales, family, x)
         else:
-            p = family.parameter_matrix(slice(None), len(x0s))[indices]
-            magnitudes = evaluate_at_points(
-                member_rounding_scales, (family.form, p.shape[1]), np.concatenate([p, x], axis=1)
-            )
+            magnitudes = family.evaluate(energy_and_entropy_rounding_scales, indices, x)
         return {
             name: np.nan_to_num(magnitudes[:, k]) for k, name in enumerate(("energy", "entropy")[: magnitudes.shape[1]])
         }
@@ -348,10 +344,6 @@ class PointSolver:
 def _expand_mask_dims(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the mask with appended axes of length 1, so that it broadcasts against the values."""
     return mask.reshape(-1, *[1] * (values.ndim - 1))
-
-
-def _system_rounding_scales(system: System, x):
-    return rounding_scales(energy_and_entropy(system), x)[1]
 
 
 def describe_error(error: Exception) -> str:

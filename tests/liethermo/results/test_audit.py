@@ -354,6 +354,51 @@ def test_consistency_is_judged_by_short_steps(method, is_consistent):
     assert is_consistent or row.value == pytest.approx(1e-3, rel=0.01)
 
 
+@pytest.mark.parametrize(
+    ("method", "is_consistent"),
+    [(lt.MetriplecticMidpoint(), True), (SlowedMidpoint(), False)],
+    ids=["right", "slow"],
+)
+@pytest.mark.parametrize(
+    ("engine", "step"),
+    [("array", 0.1), ("compiled", 0.1), ("compiled", lt.Adaptive(1e-6))],
+    ids=["array", "compiled", "adaptive"],
+)
+def test_an_ensemble_is_as_consistent_as_its_trajectories(engine, method, is_consistent, step):
+    """The slow method keeps energy and Casimirs, so an ensemble with it shows nothing else."""
+    x0s = [[0.3, 1.0, -0.2], [0.5, -0.2, 0.9], [0.0, 0.0, 0.0]]
+    many = lt.ensemble(rigid_body(), x0s, (0.0, 4.0), step, method, engine=engine)
+    single = lt.integrate(rigid_body(), x0s[0], (0.0, 4.0), step, method, engine=engine)
+    rows = [only_row(result.audit(), "consistency") for result in (many, single)]
+    assert [row.passed for row in rows] == [is_consistent] * 2, rows
+    assert [row.note for row in rows] == [rows[1].note] * 2
+    if not is_consistent:
+        assert [row.value for row in rows] == pytest.approx([1e-3] * 2, rel=0.01)
+        assert many.audit().verdict == "the laws hold, but THE STEPS DO NOT FOLLOW THE VECTOR FIELD"
+        assert not many.audit().passed
+
+
+class SlowedWithWeakFriction(lt.MetriplecticMidpoint):
+    """Control: a method that is slow for systems whose friction is weaker than 0.05, and right for others."""
+
+    def slopes(self, system, x, compensation, h, k):
+        factor = jnp.where(system.dissipation.rate < 0.05, 0.999, 1.0)
+        return factor * super().slopes(system, x, compensation, h, k)
+
+
+@pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-6)], ids=["fixed", "adaptive"])
+@pytest.mark.parametrize("weakest_rate", [0.06, 0.04])
+def test_one_system_of_an_ensemble_that_the_method_does_not_follow(weakest_rate, step):
+    """Steps of every trajectory are compared with its own vector field."""
+    rates = np.linspace(0.1, 0.3, 20)
+    rates[7] = weakest_rate
+    body, x0 = lt.models.rigid_body(rate=0.2), [0.3, 1.0, -0.2]
+    many = lt.ensemble(body, x0, (0.0, 4.0), step, SlowedWithWeakFriction(), parameters={"dissipation.rate": rates})
+    row = only_row(many.audit(), "consistency")
+    assert row.passed is (weakest_rate > 0.05), row
+    assert row.value == pytest.approx(0.0 if row.passed else 1e-3, rel=0.01, abs=1e-8)
+
+
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("outputs", ["trajectory", "final", "summary"])
 def test_an_ensemble_reports_an_entropy_that_should_be_constant(outputs):

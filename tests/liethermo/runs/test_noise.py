@@ -60,6 +60,17 @@ def test_both_engines_take_the_same_path(system, noise):
         assert "a law of the mean" in str(array.audit())
 
 
+def test_an_ensemble_with_noise_shows_the_rows_of_one_run():
+    """The length of a spin is conserved on every path, and an ensemble says so too."""
+    single = run(SPIN, BATH, "compiled").audit()
+    many = lt.ensemble(SPIN, np.stack([START, -START]), (0.0, 5.02), 0.05, noise=BATH, engine="compiled").audit()
+    drifts = [[row for row in audit.rows if row.law.startswith("drift of")] for audit in (single, many)]
+    assert [[(row.law, row.passed) for row in rows] for rows in drifts] == [
+        [("drift of mu1**2 + mu2**2 + mu3**2", True)]
+    ] * 2
+    assert many.casimir_drift < 1e-14
+
+
 def test_a_path_depends_on_seed_and_numbers_alone():
     """Not on what is saved, on the size of the ensemble, its lanes and portions, or the engine."""
     whole_run = lt.ensemble(BODY, np.tile(START, (19, 1)), (0.0, 2.0), 0.05, noise=NOISE, outputs="trajectory")
