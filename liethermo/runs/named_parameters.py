@@ -97,7 +97,7 @@ def replace_parameters(system: System, values: Mapping[str, Any]) -> System:
 
 
 class ParameterCondition(NamedTuple):
-    """What the constructor of an object requires of the values of one of its fields, and new values have to meet.
+    """Condition that the constructor of an object sets on the values of a field, and that new values must meet.
 
     Attributes
     ----------

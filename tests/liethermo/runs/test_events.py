@@ -382,7 +382,7 @@ def test_an_exception_of_an_event_function_is_the_users_own():
     ("until", "message"),
     [
         ([], "an event at least"),
-        ([lambda a, b, c: 0.0], r"has the arguments \(x\) or \(t, x\)"),
+        ([lambda a, b, c: 0.0], r"must have the arguments \(x\) or \(t, x\)"),
         ([lambda x: x[0], 3.0], r"lt\.Relaxed\(tol\) or a function"),
         (with_attributes(lambda x: x[0], terminal=-1), "terminal must be True or the number"),
     ],
