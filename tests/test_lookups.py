@@ -29,8 +29,6 @@ FOREIGN = {
     "func_filename": "of the debug information of JAX, which may be None",
     "frames": "of a traceback of JAX, which may be None",
     "name": "of axes of matplotlib; of a group, in a message about another one",
-    "debug_info": "of a program of JAX; versions of JAX differ in where they keep it",
-    "func_filename": "of a program of JAX",
     "model_fields": "of a model of pydantic; typed dictionaries have none",
     "metric": "of a manifold of geomstats",
     "submersion": "of a manifold of geomstats",
