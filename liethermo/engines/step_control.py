@@ -20,6 +20,7 @@ from manifolds._pytree_module import Module
 from ..dissipation.geometry import project_tangent
 from ..integrators import OneStepMethod
 from ..systems import System
+from ..systems.clock import clock_components
 from ..tracing.programs import jit_cached
 from . import root_bracket
 from .solver_options import EPS
@@ -87,8 +88,17 @@ def arnoldi_hessenberg(system, method, x):
 
 
 def _jacobian_product(system: System, x) -> Callable:
-    """Return the product of the Jacobian of the vector field at x with tangent vectors, as a function."""
-    return lambda v: project_tangent(system, x, jax.jvp(system.vector_field, (x,), (project_tangent(system, x, v),))[1])
+    """Return the product of the Jacobian of the vector field at x with tangent vectors, as a function.
+
+    Rows and columns of the time and the work are zero: nothing grows by them, and in the unit of the clock derivatives
+    by the time are so large that the eigenvalues of the whole matrix would be rounding errors.
+    """
+
+    def restrict(v) -> jax.Array:
+        v = project_tangent(system, x, v)
+        return v - clock_components(system, v)
+
+    return lambda v: restrict(jax.jvp(system.vector_field, (x,), (restrict(v),))[1])
 
 
 def _fixed_random_vector(n: int) -> np.ndarray:

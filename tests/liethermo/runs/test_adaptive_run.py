@@ -318,6 +318,27 @@ def test_a_row_of_wells_leaves_its_rest():
     )
 
 
+@pytest.mark.parametrize("method", [lt.MetriplecticRungeKutta(8), lt.MetriplecticGauss(3)], ids=str)
+@pytest.mark.parametrize("n_bodies", [2, 3])
+def test_the_clock_of_a_driven_system_does_not_grow(method, n_bodies):
+    """Derivatives by the time are huge in the unit of the clock; the rates of growth must not be their rounding."""
+    inertia = np.linspace(1.0, 4.0, 3 * n_bodies)
+    amplitudes = 0.05 * np.arange(1.0, 3.0 * n_bodies + 1.0)
+    bodies = lt.LiePoissonSystem(
+        mf.direct_sum(*[mf.so(3)] * n_bodies), lt.Quadratic(1.0 / inertia), torque=lambda t, mu: jnp.cos(t) * amplitudes
+    )
+    x0 = np.linspace(-1.0, 1.0, 3 * n_bodies)
+
+    def field(t, x):
+        momenta, velocities = x.reshape(-1, 3), (x / inertia).reshape(-1, 3)
+        return np.cross(momenta, velocities).ravel() + np.cos(t) * amplitudes
+
+    exact = solve_ivp(field, (0.0, 3.0), x0, "DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+    solution = lt.integrate(bodies, x0, (0.0, 3.0), lt.Adaptive(1e-8), method)
+    assert np.abs(solution.x[-1] - exact).max() < 1e-7
+    assert len(solution.t) < 40
+
+
 def wells(n):
     def energy(x):
         q, p = x[:n], x[n:]
