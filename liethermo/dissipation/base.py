@@ -56,7 +56,10 @@ class Dissipation(Module):
 
     @property
     def is_symmetric(self) -> bool:
-        """True if the force is ``K(x) grad S`` with a symmetric K; False for a skew bracket with the energy [SML 6]."""
+        """True if the force is ``K(x) grad S`` with a symmetric K.
+
+        Otherwise it is a skew bracket with the energy [SML 6].
+        """
         return True
 
     @property
@@ -409,12 +412,14 @@ class LiftedDissipation(Dissipation):
 
     @classmethod
     def lift_terms(
-        cls, dissipation: Dissipation | None, pullback: Callable[[Energy], Energy], *extra_fields
+        cls, dissipation: Dissipation | None, pull_back_function: Callable[[Energy], Energy], *extra_fields
     ) -> Dissipation | None:
         """Return the lifted summands, their preserved functions pulled back; a subclass gets ``extra_fields`` too."""
         if dissipation is None:
             return None
-        terms = tuple(cls(term, tuple(map(pullback, term.preserve)), *extra_fields) for term in dissipation.terms)
+        terms = tuple(
+            cls(term, tuple(map(pull_back_function, term.preserve)), *extra_fields) for term in dissipation.terms
+        )
         return terms[0] if len(terms) == 1 else DissipationSum(terms)
 
     energy_law = forward_to("inner")

@@ -250,9 +250,9 @@ class KillingDissipation(BracketDissipation):
 
 
 def _bracket_dissipation_factor(system, dH, form) -> Factor | None:
-    """Return the factor of ``ad*_dH 𝒦 ad_dH``, whose columns have divergence zero; None if 𝒦 has no known root.
+    """Return B with ``B B^T = ad*_dH 𝒦 ad_dH``, or None if no R with ``R R^T = 𝒦`` is known.
 
-    C is skew in a, b: ``div ad*_dH F = C[a, b, c] H_ab F_c`` vanishes.
+    The divergence of each column of B is zero: C is skew in a, b, so ``div ad*_dH F = C[a, b, c] H_ab F_c`` vanishes.
     """
     root, g = form_root(form), system.algebra
     return None if root is None else Factor(g.dim, lambda w: g.ad_star(dH, root @ w), solenoidal=True)

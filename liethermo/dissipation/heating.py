@@ -164,7 +164,7 @@ def couple_to_baths(
     body: Geometry,
     n_baths: int,
     has_positive_temperatures: bool,
-    pullback: Callable[[Energy], Energy],
+    pull_back_function: Callable[[Energy], Energy],
 ) -> Dissipation:
     """Return the dissipation of a body with ``n_baths`` baths that take its heat.
 
@@ -180,7 +180,7 @@ def couple_to_baths(
             f"{reason}, so there is no heat for baths=. Remove baths=, or use lt.DoubleBracket or lt.Friction"
         )
     coupled_terms = tuple(
-        _couple_term_to_baths(term, body, n_baths, has_positive_temperatures, pullback) for term in terms
+        _couple_term_to_baths(term, body, n_baths, has_positive_temperatures, pull_back_function) for term in terms
     )
     return coupled_terms[0] if len(coupled_terms) == 1 else DissipationSum(coupled_terms)
 
@@ -190,10 +190,10 @@ def _couple_term_to_baths(
     body: Geometry,
     n_baths: int,
     has_positive_temperatures: bool,
-    pullback: Callable[[Energy], Energy],
+    pull_back_function: Callable[[Energy], Energy],
 ) -> Dissipation:
     """Return one summand of a body's dissipation in the system with baths; it heats a bath if it lowers the energy."""
-    functions = tuple(map(pullback, term.preserve))
+    functions = tuple(map(pull_back_function, term.preserve))
     if term.energy_law != "nonincreasing":
         return HeatlessDissipation(term, functions)
     bath = Indices(0) if term.heated_bath_index is None else term.heated_bath_index

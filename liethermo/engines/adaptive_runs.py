@@ -282,7 +282,7 @@ class PauseHandler:
         """Return the indices of the trajectories that pause for ``reason``."""
         return np.flatnonzero(self.adaptive_runs.read("status") == reason)
 
-    def decide_sign_changes(self) -> None:
+    def end_or_resume_at_sign_changes(self) -> None:
         """Decide for each trajectory paused at a sign change whether it is an event: a zero, to rounding.
 
         The run ends at the last zero that it waits for. Otherwise it resumes, as it does after a jump or a pole. If a

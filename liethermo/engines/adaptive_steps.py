@@ -3,7 +3,8 @@
 An adaptive run carries an :class:`.AdaptiveState`. One attempt takes a step, estimates its error, and chooses the size
 of the next step. The run pauses when the host has to act: at a stop time, if the growth rate must be computed, and at a
 possible event. A step in which the event function changes its sign is repeated with shorter sizes, until it ends at
-the sign change: at a zero, which is an event, or at a jump (:meth:`.sparse_engine.PauseHandler.decide_sign_changes`).
+the sign change: at a zero, which is an event, or at a jump
+(:meth:`.adaptive_runs.PauseHandler.end_or_resume_at_sign_changes`).
 """
 
 from __future__ import annotations
@@ -238,9 +239,9 @@ def apply_event_detection(
     values_before, values = adaptive_state.event_values, control.event_values(system, outcome.time_after, new_state.x)
     bracket, _ = root_bracket.unpack_bracket_and_end_values(adaptive_state.root_bracket)
     signed_values = jnp.where(jnp.isnan(values) & jnp.isinf(values_before), values_before, values)
-    first_value = root_bracket.value_of_first_event_function(control.event_directions, values_before, signed_values)
+    combined_value = root_bracket.combined_event_value(control.event_directions, values_before, signed_values)
     is_searching = bracket.step_size > 0.0
-    is_solved = (new_state.status == StatusCode.COMPLETED) & ~jnp.isnan(first_value)
+    is_solved = (new_state.status == StatusCode.COMPLETED) & ~jnp.isnan(combined_value)
     has_event = jnp.any(are_event_crossings(control, values_before, values))
     starts_search = outcome.is_accepted & has_event & ~is_searching
     is_shortened, first_fraction = jnp.zeros((), dtype=bool), jnp.ones(())
@@ -250,7 +251,7 @@ def apply_event_detection(
         )
         is_shortened = outcome.is_accepted & is_undone & ~is_searching
         starts_search = starts_search & ~is_shortened
-    next_bracket, is_root = root_bracket.narrow_bracket(bracket, first_value)
+    next_bracket, is_root = root_bracket.narrow_bracket(bracket, combined_value)
     ends_at_root = is_searching & is_solved & is_root
     ends_at_start = is_searching & is_solved & ~is_root & (next_bracket.trial_fraction <= 4.0 * EPS)
     time_advances = outcome.time_after > adaptive_state.t
@@ -276,7 +277,7 @@ def apply_event_detection(
             status,
         )
     initial_bracket = root_bracket.bracket_from_step(
-        h, *root_bracket.values_of_first_event_function_at_step_ends(control.event_directions, values_before, values)
+        h, *root_bracket.combined_event_values_at_step_ends(control.event_directions, values_before, values)
     )
     end_values = jnp.where(ends_at_start, values_before, jnp.where(time_advances, signed_values, 0.0))
     updated_search = jnp.where(

@@ -58,8 +58,8 @@ def unpack_bracket_and_end_values(packed) -> tuple[RootBracket, Any]:
     return RootBracket(*packed[:n_fields]), packed[n_fields:]
 
 
-def value_of_first_event_function(directions: tuple[int, ...], values_before, values) -> jax.Array:
-    """Return, at a point of a step, the value of one function whose first zero in the step is the first event.
+def combined_event_value(directions: tuple[int, ...], values_before, values) -> jax.Array:
+    """Return, at a point of a step, the value of a function whose first zero in the step is the first event.
 
     It is the only event function, or the minimum of them, each divided by its value at the start of the step. Functions
     that are zero or unknown there have no event in the step, nor have those whose events are in the other direction.
@@ -73,17 +73,17 @@ def value_of_first_event_function(directions: tuple[int, ...], values_before, va
     return jnp.min(jnp.where(can_cross, values / scale, 1.0))
 
 
-def values_of_first_event_function_at_step_ends(
+def combined_event_values_at_step_ends(
     directions: tuple[int, ...], values_before, values_after
 ) -> tuple[jax.Array, jax.Array]:
-    """Return :func:`value_of_first_event_function` at the start and at the end of a step in which an event happens.
+    """Return :func:`combined_event_value` at the start and at the end of a step in which an event happens.
 
     Functions that are NaN at the end are left out.
     """
     if len(directions) == 1:
         return values_before[0], values_after[0]
     values_after = jnp.where(jnp.isnan(values_after), values_before, values_after)
-    return jnp.ones(()), value_of_first_event_function(directions, values_before, values_after)
+    return jnp.ones(()), combined_event_value(directions, values_before, values_after)
 
 
 def bracket_from_step(step_size, value_before, value_after) -> RootBracket:

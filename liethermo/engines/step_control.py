@@ -226,8 +226,8 @@ def jacobian_probe_shape(system: System, method: OneStepMethod, control: StepCon
 
 
 def next_step_size_and_end_time(control: StepControl, adaptive_state: AdaptiveState) -> tuple[jax.Array, jax.Array]:
-    """Return the size of the next step, a full step or a trial step of an event search, and the time after it."""
-    h, time_after = next_full_step_size_and_end_time(control, adaptive_state)
+    """Return the size of the next step, which may be a trial step of an event search, and the time after it."""
+    h, time_after = next_step_size_and_end_time_outside_event_search(control, adaptive_state)
     if not control.event_functions:
         return h, time_after
     bracket, _ = root_bracket.unpack_bracket_and_end_values(adaptive_state.root_bracket)
@@ -236,10 +236,13 @@ def next_step_size_and_end_time(control: StepControl, adaptive_state: AdaptiveSt
     return jnp.where(bracket.step_size > 0.0, trial_step, h), jnp.where(bracket.step_size > 0.0, trial_time, time_after)
 
 
-def next_full_step_size_and_end_time(
+def next_step_size_and_end_time_outside_event_search(
     control: StepControl, adaptive_state: AdaptiveState
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the size of the next full step and the time at its end; no step ends just before a stop time."""
+    """Return the size of the next step outside an event search, and the time at its end.
+
+    No step ends just before a stop time.
+    """
     if control.adaptive:
         remaining = adaptive_state.stop_time - adaptive_state.t
         reaches_stop = remaining <= adaptive_state.next_step_size * (1 + 1e-12)

@@ -19,8 +19,8 @@ from manifolds.structures.spins import (
     dot_vectors,
     reshape_vectors,
     scale_vectors,
-    spins_from_state,
-    state_from_spins,
+    spin_components_from_state,
+    state_from_spin_components,
     sum_of_dots,
 )
 
@@ -152,11 +152,11 @@ class SphereLengths:
 
     def _leading_vectors(self, v) -> VectorComponents:
         """Return the first ``count`` vectors of three components of a flat array, by components."""
-        return spins_from_state(v, self.count, self.planar)
+        return spin_components_from_state(v, self.count, self.planar)
 
     def _replace_vectors(self, v, vectors: VectorComponents) -> jax.Array:
         """Return a flat array with its first ``count`` vectors replaced."""
-        return state_from_spins(vectors, v[3 * self.count :], self.planar)
+        return state_from_spin_components(vectors, v[3 * self.count :], self.planar)
 
 
 def _safe_quotient(numerator, square) -> jax.Array:

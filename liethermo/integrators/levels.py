@@ -111,9 +111,10 @@ def project_onto_levels(
     follow_leaf: bool = False,
     momentum_dim: int = 0,
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the displacement nearest to d with the required changes of the functions, and its residual as a length.
+    """Return the displacement nearest to d that changes the functions by ``target_changes``, and its residual.
 
-    ``start_gradients`` are the gradients of the functions at x + compensation, ``target_changes`` the required changes.
+    The residual is the length by which the displacement misses these changes. ``start_gradients`` are the gradients of
+    the functions at x + compensation.
     With ``follow_leaf`` the displacement is along the symplectic leaf, and d is the covector that carries the state.
     The first ``momentum_dim`` components are a momentum of constant length, which corrections leave at zero, and move
     less the smaller it is.

@@ -34,10 +34,10 @@ def check_preserved(system: System, functions: Sequence[Energy]) -> None:
     """
     for C, is_conserved in zip(functions, conserves(system, tuple(functions)), strict=True):
         if is_conserved is False:
-            raise InputError(why_not_preserved(C))
+            raise InputError(nonconservation_message(C))
 
 
-def why_not_preserved(C: Energy) -> str:
+def nonconservation_message(C: Energy) -> str:
     """Return the error message for a function that the system does not conserve."""
     name = function_name(C) or str(C)
     return (

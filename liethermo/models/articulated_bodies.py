@@ -490,27 +490,27 @@ class WeightPotential(Energy):
 
     def rounding_scale(self, x) -> jax.Array:
         """Return the sum of the weights times the lengths of the chains that carry them."""
-        return jax.lax.stop_gradient(_weight_rounding_scale(self, x))
+        return jax.lax.stop_gradient(_weight_potential_rounding_scale(self, x))
 
 
 @jit_subprogram
-def _weight_potential(weight: WeightPotential, x) -> jax.Array:
-    return weight.mechanism.weight_potential(x[: weight.mechanism.n_joints], weight.gravity)
+def _weight_potential(potential: WeightPotential, x) -> jax.Array:
+    return potential.mechanism.weight_potential(x[: potential.mechanism.n_joints], potential.gravity)
 
 
 @jit_subprogram
-def _weight_rounding_scale(weight: WeightPotential, x) -> jax.Array:
-    mechanism, q = weight.mechanism, x[: weight.mechanism.n_joints]
+def _weight_potential_rounding_scale(potential: WeightPotential, x) -> jax.Array:
+    mechanism, q = potential.mechanism, x[: potential.mechanism.n_joints]
     strokes = jnp.where(np.array(mechanism.slides), jnp.abs(q), 0.0)
     lengths = mechanism._path_matrix @ (jnp.linalg.norm(mechanism.places, axis=1) + strokes)
     arms = lengths[np.array(mechanism.body_links)] + jnp.linalg.norm(mechanism.centres, axis=1)
-    return jnp.linalg.norm(weight.gravity) * jnp.dot(mechanism.masses, arms)
+    return jnp.linalg.norm(potential.gravity) * jnp.dot(mechanism.masses, arms)
 
 
 @jit_subprogram
-def _weight_gradient(weight: WeightPotential, x) -> jax.Array:
-    k = weight.mechanism.n_joints
-    return jnp.concatenate([-weight.mechanism.weight_forces(x[:k], weight.gravity), jnp.zeros(k)])
+def _weight_gradient(potential: WeightPotential, x) -> jax.Array:
+    k = potential.mechanism.n_joints
+    return jnp.concatenate([-potential.mechanism.weight_forces(x[:k], potential.gravity), jnp.zeros(k)])
 
 
 class SquaredMomentum(Pullback):

@@ -104,7 +104,7 @@ def read_urdf(source: str | os.PathLike, fixed_base: bool = False) -> list[BodyR
                 f"the joint {name!r} is of type {kind!r}, which is not covered. The types that are: "
                 f"{', '.join(URDF_JOINTS)}"
             )
-        parent, child = (_required_attribute(_only_child(joint, tag), "link") for tag in ("parent", "child"))
+        parent, child = (_required_attribute(_required_only_child(joint, tag), "link") for tag in ("parent", "child"))
         for link in (parent, child):
             if link not in links:
                 raise InputError(f"the joint {name!r} names the link {link!r}, which the file does not have")
@@ -122,7 +122,7 @@ def read_urdf(source: str | os.PathLike, fixed_base: bool = False) -> list[BodyR
         names += [
             child
             for child, joint in joint_of.items()
-            if _required_attribute(_only_child(joint, "parent"), "link") == name
+            if _required_attribute(_required_only_child(joint, "parent"), "link") == name
         ]
     if len(records) < len(links):
         unreached_links = sorted(set(links) - {record.name for record in records})
@@ -142,9 +142,9 @@ def _read_urdf_link(name: str, link: Element, joint: Element | None) -> LinkReco
     mass, centre, inertia = 0.0, np.zeros(3), np.zeros((3, 3))
     if (inertial := link.find("inertial")) is not None:
         _refuse_unknown_children(inertial, f"inertial of {name!r}", {"origin", "mass", "inertia"}, set())
-        mass = _number_attribute(_only_child(inertial, "mass"), "value")
+        mass = _number_attribute(_required_only_child(inertial, "mass"), "value")
         entries = {
-            key: _number_attribute(_only_child(inertial, "inertia"), key)
+            key: _number_attribute(_required_only_child(inertial, "inertia"), key)
             for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
         }
         R, centre = _read_urdf_origin(inertial)
@@ -164,7 +164,7 @@ def _read_urdf_link(name: str, link: Element, joint: Element | None) -> LinkReco
             damping = _number_attribute(dynamics, "damping", 0.0)
             _refuse_nonzero_attribute(dynamics, "friction", f"dynamics of the joint {joint_name!r}")
         joints = (JointRecord(kind == "prismatic", np.zeros(3), direction, 0.0, damping, 0.0),)
-    parent = _required_attribute(_only_child(joint, "parent"), "link")
+    parent = _required_attribute(_required_only_child(joint, "parent"), "link")
     return LinkRecord(name, parent, rotation, origin, mass, centre, inertia, joints)
 
 
@@ -193,7 +193,7 @@ def read_mjcf(source: str | os.PathLike) -> tuple[list[BodyRecord], bool]:
         for name in ("density", "viscosity", "wind"):
             _refuse_nonzero_attribute(option, name, "option")
     reader = _MjcfReader(root)
-    world = _only_child(root, "worldbody")
+    world = _required_only_child(root, "worldbody")
     _refuse_unknown_children(world, "worldbody", {"body"}, MJCF_SHAPES)
     bodies = world.findall("body")
     if not bodies:
@@ -527,7 +527,7 @@ def _refuse_nonzero_attribute(element: Element, attribute_name: str, owner_text:
         raise InputError(f"{attribute_name} of {owner_text} must be zero, got {element.attrib[attribute_name]!r}")
 
 
-def _only_child(element: Element, tag: str) -> Element:
+def _required_only_child(element: Element, tag: str) -> Element:
     """Return the child of an XML element with this tag; raise InputError unless there is exactly one."""
     children = element.findall(tag)
     if len(children) != 1:

@@ -53,43 +53,54 @@ class StepSample(NamedTuple):
         return StepSample(*(values[indices] for values in self))
 
 
-def select_step_sample(system: System, x: np.ndarray, t: np.ndarray, h: np.ndarray, replay: Callable) -> StepSample:
+def sample_steps_of_run(
+    system: System, saved_states: np.ndarray, saved_times: np.ndarray, step_sizes: np.ndarray, replay: Callable
+) -> StepSample:
     """Return a sample of the steps of a single run: all, or if these are too many, those with the fastest motion.
 
     Parameters
     ----------
-    x : array, shape (times, n)
-        Saved states.
-    t, h : array, shape (times,) and (times - 1,)
-        Their times; the size of the steps from each.
+    saved_states : array, shape (times, n)
+    saved_times : array, shape (times,)
+    step_sizes : array, shape (times - 1,)
+        Size of the steps from each saved time to the next.
     replay : function of (x, h, steps) to an array, shape (at most steps, n)
         Returns the states after repeated steps.
     """
-    gaps = np.diff(t)
-    counts = np.rint(gaps / h)
-    # whether ``counts`` steps of size h lead from a saved state to the next
-    is_uniform = (counts > 0) & (np.abs(gaps - counts * h) <= 1e-6 * h)
+    gaps = np.diff(saved_times)
+    counts = np.rint(gaps / step_sizes)
+    # whether ``counts`` steps of equal size lead from a saved state to the next
+    is_uniform = (counts > 0) & (np.abs(gaps - counts * step_sizes) <= 1e-6 * step_sizes)
     counts = np.where(is_uniform, counts, 1).astype(int)
     has_both_ends = is_uniform & (counts == 1)
     costs = np.where(has_both_ends, 1, REPLAY_COST_RATIO * counts)
-    budget = max(MIN_SAMPLED_STEPS * REPLAY_COST_RATIO, MAX_SAMPLED_VALUES // x.shape[1])
+    budget = max(MIN_SAMPLED_STEPS * REPLAY_COST_RATIO, MAX_SAMPLED_VALUES // saved_states.shape[1])
     order = (
-        np.arange(len(h))
+        np.arange(len(step_sizes))
         if costs.sum() <= budget
-        else _order_by_field_change(system, x, h, max(MIN_SAMPLED_STEPS, budget // 4))
+        else _order_by_field_change(system, saved_states, step_sizes, max(MIN_SAMPLED_STEPS, budget // 4))
     )
     cumulative_cost = np.cumsum(costs[order])
     order = order[cumulative_cost - costs[order] < budget]
     if has_both_ends[order].all():
-        return StepSample(np.zeros_like(order), t[order], h[order], x[order], x[order + 1])
+        return StepSample(
+            np.zeros_like(order), saved_times[order], step_sizes[order], saved_states[order], saved_states[order + 1]
+        )
     samples: list[StepSample] = []
     for i in order:
-        states = x[i : i + 2]
+        states = saved_states[i : i + 2]
         if not has_both_ends[i]:
-            states = np.vstack([x[i], replay(x[i], h[i], min(counts[i], -(-budget // REPLAY_COST_RATIO)))])
+            states = np.vstack(
+                [
+                    saved_states[i],
+                    replay(saved_states[i], step_sizes[i], min(counts[i], -(-budget // REPLAY_COST_RATIO))),
+                ]
+            )
         numbers = np.arange(len(states) - 1)
-        sizes = np.full(len(numbers), h[i])
-        samples.append(StepSample(np.zeros_like(numbers), t[i] + h[i] * numbers, sizes, states[:-1], states[1:]))
+        sizes = np.full(len(numbers), step_sizes[i])
+        samples.append(
+            StepSample(np.zeros_like(numbers), saved_times[i] + step_sizes[i] * numbers, sizes, states[:-1], states[1:])
+        )
         budget -= costs[i]
     return StepSample(*(np.concatenate(arrays) for arrays in zip(*samples, strict=True)))
 

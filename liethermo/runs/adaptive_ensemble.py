@@ -61,7 +61,7 @@ class AdaptiveEnsembleRun(EnsembleRun):
             drive_adaptive(recorder.pause_handler, recorder)
         except KeyboardInterrupt:
             self.is_interrupted = True
-        recorder.record_interrupted()
+        recorder.record_unfinished_as_interrupted()
 
 
 class _BatchRecorder:
@@ -154,7 +154,7 @@ class _BatchRecorder:
             self.members, self.is_running = self.members[running], self.is_running[running]
             self.initial = {name: values[running] for name, values in self.initial.items()}
 
-    def record_interrupted(self) -> None:
+    def record_unfinished_as_interrupted(self) -> None:
         """Record the unfinished trajectories as interrupted."""
         indices = np.flatnonzero(self.is_running)
         if indices.size:

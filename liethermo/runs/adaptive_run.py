@@ -170,7 +170,7 @@ class AdaptiveRun:
             self.undefined_events = np.flatnonzero(is_undefined).tolist()
 
     def _record_failure(self) -> None:
-        """Record why the run has ended before its end, if it has."""
+        """If the run has stopped early, record why."""
         code = int(self._scalar("status"))
         if code == StatusCode.STEP_LIMIT:
             self.exhausted_limit = "steps"

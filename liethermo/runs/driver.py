@@ -67,7 +67,7 @@ def drive_adaptive(pause_handler: PauseHandler, recorder: AdaptiveRecorder) -> N
     pause_handler.resume_paused()
     while recorder.continues():
         recorder.attempt()
-        pause_handler.decide_sign_changes()
+        pause_handler.end_or_resume_at_sign_changes()
         recorder.record_pauses()
         pause_handler.resume_paused()
         recorder.record_ended_trajectories()

@@ -28,7 +28,7 @@ from ..results.step_sampling import (
     REPLAY_COST_RATIO,
     StepSample,
     hermite_defect,
-    select_step_sample,
+    sample_steps_of_run,
     vector_field,
 )
 from ..systems import System
@@ -408,7 +408,7 @@ class RunEvidence:
             return evidence
         user_states = np.asarray(self.system.points(sampled_x)).reshape(len(sampled_x), -1).view(np.float64)
         min_motion = MIN_MOTION_FRACTION * np.ptp(user_states, axis=0).max(keepdims=True)
-        sample = select_step_sample(
+        sample = sample_steps_of_run(
             self.system, self.x[: len(h) + 1], self.t[: len(h) + 1], h, self.replay.states_after_steps
         )
 

@@ -19,7 +19,7 @@ import numpy as np
 from manifolds._pytree_module import replace_fields
 
 from ..integrators import OneStepMethod
-from ..integrators.preserved import casimir_residuals, is_momentum_map, why_not_preserved
+from ..integrators.preserved import casimir_residuals, is_momentum_map, nonconservation_message
 from ..systems import System
 from ..systems.conservation import judge_conservation, rates_of_change
 from ..systems.interface import InvariantVerdicts
@@ -115,7 +115,7 @@ def group_members_by_invariants(
         members.verdicts_of_requested_functions(),
     )
     refusal_reasons = {
-        int(i): why_not_preserved(members.requested_functions[j])
+        int(i): nonconservation_message(members.requested_functions[j])
         for i, j in np.argwhere(requested_verdicts == VERDICT_NOT_CONSERVED)[::-1]
     }
     rows = np.concatenate([multiples, known_verdicts, members.are_momentum_maps()], axis=1)

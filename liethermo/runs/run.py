@@ -108,7 +108,7 @@ class Run:
                 bar.update(self.schedule.time_after(int(trajectory.read("step"))))
                 if trajectory.read("status") != StatusCode.COMPLETED:
                     return False
-                self._checkpoint(lambda: trajectory.state)
+                self._write_checkpoint_if_due(lambda: trajectory.state)
                 return True
 
             calls = self.schedule.engine_calls(
@@ -164,7 +164,7 @@ class Run:
             if self.all_states is not None:
                 self.all_states.append((ends, steps.x))
             bar.update(ends[-1])
-            self._checkpoint(lambda: steps.state_after)
+            self._write_checkpoint_if_due(lambda: steps.state_after)
 
         length = end - start if math.isfinite(end) else ENDLESS_SPAN_LENGTH
         control = make_step_control(step, self.method, end - start, events)
@@ -292,7 +292,7 @@ class Run:
         times, states = zip(*self.all_states, strict=True)
         return DenseOutput(np.concatenate(times), np.concatenate(states), self.engine.step_ends)
 
-    def _checkpoint(self, read_state: Callable[[], State]) -> None:
+    def _write_checkpoint_if_due(self, read_state: Callable[[], State]) -> None:
         """Write the run so far to the file ``save_to``, if enough time has passed since the last write."""
         if self.save_to is not None and time.perf_counter() - self.last_checkpoint_time > CHECKPOINT_SECONDS:
             self.stats = run_statistics(read_state(), self._wall_time())

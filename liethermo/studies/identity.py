@@ -24,7 +24,7 @@ N_PROBE_STATES = 3
 """Number of sampled states, besides the initial state, at which the vector field is recorded."""
 
 
-def study_as_json(solver: PointSolver, example_results: PointResults, x0: np.ndarray) -> dict[str, Any]:
+def study_as_json(solver: PointSolver, example_results: PointResults, example_x0: np.ndarray) -> dict[str, Any]:
     """Return JSON data that describe a study: its arguments, and values of its system and measures at one point.
 
     Parameters
@@ -32,11 +32,11 @@ def study_as_json(solver: PointSolver, example_results: PointResults, x0: np.nda
     solver : PointSolver
     example_results : PointResults
         Results of the example point.
-    x0 : array, shape (n,)
+    example_x0 : array, shape (n,)
         Initial state of the example point.
     """
     task, system = solver.task, solver.systems.example_system
-    states = np.concatenate([x0[None], system.samples(N_PROBE_STATES, seed=1)])
+    states = np.concatenate([example_x0[None], system.samples(N_PROBE_STATES, seed=1)])
     with np.errstate(all="ignore"):
         vector_fields = [_to_json_numbers(_system_at_time(system, task.t_span[0]).vector_field(x)) for x in states]
         energies = [_to_json_numbers(system.energy.at_time(task.t_span[0]).value(x)) for x in states]
@@ -46,7 +46,7 @@ def study_as_json(solver: PointSolver, example_results: PointResults, x0: np.nda
         "motion": vector_fields,
         "energy": energies,
         "operations": _program_digest(solver),
-        "x0": _to_json_numbers(x0),
+        "x0": _to_json_numbers(example_x0),
         "t_span": list(map(float, task.t_span)),
         "step": _step_as_json(task.step),
         "method": eqx.tree_pformat(task.method),

@@ -154,17 +154,22 @@ class PointSolver:
         self.engine: Any = task.engine
 
     def solve(
-        self, points: PointParameters, states: np.ndarray | None, n_points: int, seeds: np.ndarray | None = None
+        self,
+        points: PointParameters,
+        initial_states: np.ndarray | None,
+        n_points: int,
+        noise_seeds: np.ndarray | None = None,
     ) -> PointResults:
         """Run the systems at some points and return their results.
 
-        ``states`` are the initial states if an axis has them, and ``seeds`` the noise seeds of the points.
+        ``initial_states`` are given if an axis has them, and ``noise_seeds`` if the steps have noise; both have one
+        entry for each of the ``n_points`` points.
         """
-        self._seeds = seeds
+        self._noise_seeds = noise_seeds
         failure_messages: dict[int, str] = (
             {} if self.systems.family is None else self.systems.inadmissible_points(points, n_points)
         )
-        x0s, attitudes = states, None
+        x0s, attitudes = initial_states, None
         if self._x0 is not None:
             x0s, new_messages = self._x0(points, n_points)
             failure_messages = new_messages | failure_messages
@@ -250,9 +255,9 @@ class PointSolver:
             family = self.systems.family_at(points, padded_indices)
         attitude = None if attitudes is None else attitudes[padded_indices]
         noise = None
-        if task.noise is not None and self._seeds is not None:
+        if task.noise is not None and self._noise_seeds is not None:
             seeds = FILLER_SEED_START + np.arange(len(padded_indices))  # distinct seeds for the padding
-            seeds[: len(indices)] = self._seeds[indices]
+            seeds[: len(indices)] = self._noise_seeds[indices]
             noise = replace(task.noise, seed=tuple(map(int, seeds[: len(padded_indices)])))
         options: dict[str, Any] = {"until": task.until, "save_at": task.save_at, "attitude": attitude, "noise": noise}
         result = ensemble(

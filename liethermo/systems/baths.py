@@ -136,12 +136,15 @@ class HeatBaths(Module):
 
     @property
     def scale(self) -> np.ndarray | float:
-        """Entropies over which the temperatures change, shape (number,): the capacities if they are constant."""
+        """Scale of the entropy of each bath, shape (number,): its heat capacity, or 1 if that is infinite.
+
+        All are 1 if a temperature or an energy is a function. The result is the number 1 if the energy is traced.
+        """
         return 1.0 if is_traced(self.energy) else np.asarray(self.entropy_scales())
 
     def entropy_scales(self) -> jax.Array:
         """Return the scale of the entropy of each bath, as an array that JAX can trace, shape (number,)."""
-        if not isinstance(self.energy, BathEnergy):  # any scale suits a bath of constant temperature
+        if not isinstance(self.energy, BathEnergy):  # none has a capacity, or one is given by a function
             return jnp.ones(self.number)
         return jnp.where(jnp.isfinite(self.energy.capacity), self.energy.capacity, 1.0)
 

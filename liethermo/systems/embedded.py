@@ -115,7 +115,7 @@ class EmbeddedSystem(System):
         return EmbeddedSystem(self.manifold.at_time(t), *self.wrapped_system.arguments) if self.is_driven else self
 
     def raise_index(self, x, alpha):
-        """Return the part of a gradient tangent to the level sets, the direction of corrections."""
+        """Return the part of a gradient tangent to the constraint level sets; corrections move the state along it."""
         return _tangential_part(self.manifold, x, alpha)
 
     @property

@@ -89,7 +89,10 @@ def _is_hamiltonian_term(term) -> bool:
 
 
 def _energy_of_terms(terms: Sequence, times) -> tuple[int, Energy]:
-    """Return the number of levels and the energy of a Hamiltonian ``[H0, (H1, f), ...]``, ``H0 + f(t) H1 + ...``."""
+    """Return the number of levels of a Hamiltonian ``H0 + f(t) H1 + ...`` and its energy as a function of the state.
+
+    The terms are given as ``[H0, (H1, f), ...]``.
+    """
     constant: list[np.ndarray] = []
     modulated: list[np.ndarray] = []
     functions = []

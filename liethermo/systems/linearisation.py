@@ -144,13 +144,13 @@ def frozen_system(system: System, t: float | None) -> System:
         return system
     if t is not None:
         return system.at_time(t)
-    if why := _explain_time_dependence(system):
-        raise InputError(f"{why}, so it has no equilibrium. Give t= to freeze it at one time")
+    if clause := _describe_time_dependent_part(system):
+        raise InputError(f"{clause}, so it has no equilibrium. Give t= to freeze it at one time")
     return system.at_time(0.0)
 
 
-def _explain_time_dependence(system: System) -> str:
-    """Explain which part of a driven system changes with time; "" if none does at the test times."""
+def _describe_time_dependent_part(system: System) -> str:
+    """Return which part of a driven system depends on time, as a clause; "" if none does at the test times."""
     points = system.samples(3)
     velocities = np.stack([evaluate_at_points(_velocity, s, points) for s in systems_at_test_times(system)])
     scale = np.abs(velocities).max()

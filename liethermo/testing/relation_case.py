@@ -24,7 +24,7 @@ The steps of a short run accumulate 1e-14, which growing modes of the motion mul
 """
 
 
-RESOLUTION_ERROR_FACTOR = 10.0
+DISCRETISATION_ERROR_FACTOR = 10.0
 """Largest difference, in errors of the method, of two runs that divide the time into different steps."""
 
 
@@ -91,9 +91,9 @@ class RelationCase:
         return max(ROUNDING_RTOL, 0.1 * self.step.rtol) if isinstance(self.step, Adaptive) else ROUNDING_RTOL
 
     @property
-    def resolution_tolerance(self) -> float:
+    def discretisation_tolerance(self) -> float:
         """The allowed difference of runs that divide the time into different steps."""
-        return max(self.rounding_tolerance, RESOLUTION_ERROR_FACTOR * self.method_error)
+        return max(self.rounding_tolerance, DISCRETISATION_ERROR_FACTOR * self.method_error)
 
     def compare_states_with_expected(self, label: str, states, expected_states, tolerance: float) -> None:
         """Add a row to the report with the largest difference of states from expected ones, relative to the state
@@ -108,11 +108,12 @@ class RelationCase:
         run: Solution,
         to_base: Callable = lambda x: x,
         tolerance: float | None = None,
-        has_same_names: bool = True,
+        has_same_function_names: bool = True,
     ) -> None:
         """Add rows to the report that compare a run with the base run: status, states, attitude, invariants and audit.
 
-        With ``has_same_names`` the conserved functions must have equal names, otherwise only their number must agree.
+        With ``has_same_function_names`` the conserved functions must have equal names. Otherwise only their number must
+        agree.
         """
         tolerance = self.rounding_tolerance if tolerance is None else tolerance
         label = f"{self.name}: {description}"
@@ -132,7 +133,7 @@ class RelationCase:
                 f"{label}, attitude", run.attitude[compared_rows], self.base_run.attitude[compared_rows], tolerance
             )
         names, base_names = names_of_conserved_functions(run), names_of_conserved_functions(self.base_run)
-        names_agree = names == base_names if has_same_names else len(names) == len(base_names)
+        names_agree = names == base_names if has_same_function_names else len(names) == len(base_names)
         self.suite.check_true(
             f"{label}, same constants", names_agree, "" if names_agree else f"{sorted(names)}, not {sorted(base_names)}"
         )

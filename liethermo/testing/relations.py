@@ -196,13 +196,13 @@ def _check_linear_map(case: RelationCase, description: str, matrix: np.ndarray, 
         and is_permutation_equivariant(case.method)
         and not any(isinstance(term, Pullback) for term in system.energy.terms)
     )
-    has_same_names = system.lie_algebra is None  # another basis has other Casimirs
+    has_same_function_names = system.lie_algebra is None  # another basis has other Casimirs
     case.compare_with_base_run(
         description,
         run,
         change.to_old,
-        case.rounding_tolerance if is_exact else case.resolution_tolerance,
-        has_same_names,
+        case.rounding_tolerance if is_exact else case.discretisation_tolerance,
+        has_same_function_names,
     )
     return None
 
@@ -216,7 +216,7 @@ def check_uncoupled_pair(case: RelationCase) -> SkipReason:
     single_runs = case.base_run, case.run(x0=second_initial_state)
     check_run_completes(case.suite, f"{case.name}: the pair", pair)
     for run, component, name in zip(single_runs, (pair.x[-1][:n], pair.x[-1][n:]), ("one", "the other"), strict=True):
-        case.compare_states_with_expected(f"{name} of a pair", component, run.x[-1], case.resolution_tolerance)
+        case.compare_states_with_expected(f"{name} of a pair", component, run.x[-1], case.discretisation_tolerance)
     is_same_verdict = pair.audit().passed == all(run.audit().passed for run in single_runs)
     case.suite.check_true(f"{case.name}: the verdict of a pair is that of both", is_same_verdict)
     return None
@@ -236,7 +236,7 @@ def check_time_reversal(case: RelationCase) -> SkipReason:
         "there and back",
         reversed_run.x[-1],
         case.x0,
-        case.rounding_tolerance if is_symmetric else 2.0 * case.resolution_tolerance,
+        case.rounding_tolerance if is_symmetric else 2.0 * case.discretisation_tolerance,
     )
     return None
 

@@ -35,7 +35,7 @@ def check_run_split_in_time(case: RelationCase) -> SkipReason:
     split_times = times_to_split_run(case)
     if not split_times:
         return "there are too few steps"
-    tolerance = case.resolution_tolerance if isinstance(case.step, Adaptive) else case.rounding_tolerance
+    tolerance = case.discretisation_tolerance if isinstance(case.step, Adaptive) else case.rounding_tolerance
     last_segment = run_in_segments(case, split_times)
     case.compare_states_with_expected(
         f"in {len(split_times) + 1} parts", last_segment.x[-1], case.base_run.x[-1], tolerance
@@ -125,9 +125,7 @@ def check_member_is_independent_of_others(case: RelationCase) -> SkipReason:
     names = {name: value for name, value in named_parameters(case.system).items() if value.size}
     if not names:
         return "the system has no parameters"
-    values_of_members = {
-        name: np.stack([value, *degenerate_values_of_parameter(value)]) for name, value in names.items()
-    }
+    values_of_members = {name: np.stack([value, *special_values_of_parameter(value)]) for name, value in names.items()}
     (name, value), *_ = names.items()
     entry = (0,) * value.ndim
     path = name + "".join(f"[{i}]" for i in entry)
@@ -166,7 +164,7 @@ def check_member_is_independent_of_others(case: RelationCase) -> SkipReason:
     return None
 
 
-def degenerate_values_of_parameter(value: np.ndarray) -> list[np.ndarray]:
+def special_values_of_parameter(value: np.ndarray) -> list[np.ndarray]:
     """Return three special values of a parameter: with equal entries, with zeros, and with the opposite sign."""
     is_square = value.ndim == 2 and value.shape[0] == value.shape[1]
     symmetric = np.eye(len(value)) * np.trace(value) / len(value) if is_square else np.full_like(value, value.mean())
@@ -303,5 +301,5 @@ def check_diffrax_matches_integrate(case: RelationCase) -> SkipReason:
     case.compare_states_with_expected("diffeqsolve", x, case.base_run.x[-1], case.rounding_tolerance)
     x, is_successful = final_state_and_success(case.time, 0.0, -h, x)
     case.suite.check_true(f"{case.name}: backwards it succeeds", is_successful)
-    case.compare_states_with_expected("there and back", x, case.x0, 2.0 * case.resolution_tolerance)
+    case.compare_states_with_expected("there and back", x, case.x0, 2.0 * case.discretisation_tolerance)
     return None

@@ -143,7 +143,7 @@ def scalarize(
 
 
 def _collect_program(
-    builder: ProgramBuilder, inputs: Sequence, outputs: Sequence[Sequence[Scalar]], shapes: Sequence
+    builder: ProgramBuilder, inputs: Sequence, outputs: Sequence[Sequence[Scalar]], output_shapes: Sequence
 ) -> Program:
     """Return the program of the instructions that a builder has collected, without those that no output needs."""
     instructions, new_names = eliminate_dead_code_and_rename(
@@ -153,7 +153,7 @@ def _collect_program(
         tuple(map(tuple, inputs)),
         instructions,
         tuple(tuple(new_names.get(a, a) if type(a) is str else a for a in entries) for entries in outputs),
-        tuple(shapes),
+        tuple(output_shapes),
     )
 
 

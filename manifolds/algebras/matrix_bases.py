@@ -113,8 +113,10 @@ class MatrixBasis:
         return tuple(parts)
 
     def inner_products(self, parts: tuple[jax.Array, ...]) -> jax.Array:
-        """Return ``<A, e_a>`` for each a, shape (..., dim), for a matrix A in parts: the transpose of
-        :meth:`matrix`."""
+        """Return ``<A, e_a>`` for each a, shape (..., dim); A is given by its real and imaginary parts.
+
+        This is the transpose of :meth:`matrix`.
+        """
         entries = jnp.concatenate([part.reshape(*part.shape[:-2], -1) for part in parts], axis=-1)
         terms = [
             entries[..., indices] * weights

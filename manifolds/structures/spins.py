@@ -76,15 +76,15 @@ class Spins(PoissonBySharp):
 
     def spins(self, x) -> VectorComponents:
         """Return the components of the spins of a state, shape (n,): three arrays, shape (count,)."""
-        return spins_from_state(x, self.count, self.is_component_major)
+        return spin_components_from_state(x, self.count, self.is_component_major)
 
     def split_covectors(self, alpha) -> VectorComponents:
         """Return the components of covectors of the spins: three arrays, shape (count,)."""
-        return spins_from_state(alpha, self.count, self.is_component_major)
+        return spin_components_from_state(alpha, self.count, self.is_component_major)
 
     def join_state(self, spins: VectorComponents, others) -> jax.Array:
         """Return a state, shape (n,), from the components of its spins and the other components, shape (others,)."""
-        return state_from_spins(spins, others, self.is_component_major)
+        return state_from_spin_components(spins, others, self.is_component_major)
 
     def precession_rates(self, x, alpha) -> VectorComponents:
         """Return the components of ``gamma_i s_i x alpha_i``."""
@@ -129,14 +129,14 @@ class PaddedLattice(Lattice):
         return a, b, c
 
 
-def spins_from_state(x, count: int, is_component_major: bool = False) -> VectorComponents:
+def spin_components_from_state(x, count: int, is_component_major: bool = False) -> VectorComponents:
     """Return the components of the first ``count`` vectors of a state, shape (n,): three arrays, shape (count,)."""
     if is_component_major:
         return x[:count], x[count : 2 * count], x[2 * count : 3 * count]
     return split_vectors(x[: 3 * count].reshape(count, 3))
 
 
-def state_from_spins(spins: VectorComponents, others, is_component_major: bool = False) -> jax.Array:
+def state_from_spin_components(spins: VectorComponents, others, is_component_major: bool = False) -> jax.Array:
     """Return the state, shape (n,), of spins by components, with the other components behind."""
     # without the barrier, the program that joins the columns would compute what they share once for each
     columns = jax.lax.optimization_barrier(spins) if is_component_major else (stack_columns(spins).reshape(-1),)

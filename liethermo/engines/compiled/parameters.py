@@ -51,7 +51,7 @@ class ProgramStructure:
         return sum(map(math.prod, self.shapes))
 
     def build(self, p) -> Any:
-        """Return the module with the parameters p, shape (n_parameters,), all arrays flattened one after another."""
+        """Return the module whose parameter arrays, flattened and joined, are p, shape (n_parameters,)."""
         ends = list(itertools.accumulate(map(math.prod, self.shapes)))
         arrays = [p[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, self.shapes, strict=True)]
         return self.rebuild(arrays)

@@ -227,7 +227,7 @@ class Lattice(metaclass=ListedType):
                 raise InputError(f"the atoms {a} and {b} of the basis are at one position of the crystal")
 
     def bonds(self, pairs: Sequence[tuple]) -> Bonds:
-        """Return bonds by offsets: ``(a, b, offset)`` joins atom a of each cell with atom b of the cell at the offset.
+        """Return the bonds of each ``(a, b, offset)``: atom a of every cell with atom b of the cell ``offset`` away.
 
         Parameters
         ----------

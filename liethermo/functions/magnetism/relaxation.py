@@ -49,7 +49,7 @@ class Minimum(NamedTuple):
 
 @with_library_settings
 def minimise(energy, spins, tolerance: float = 1e-8, max_steps: int = 100_000) -> Minimum:
-    """Return a minimum of the energy of spins of constant lengths, by steepest descent with adaptive steps.
+    """Return spins of constant lengths at a local minimum of an energy, found by steepest descent with adaptive steps.
 
     Each step rotates every spin towards its field, by the step sizes of Barzilai & Borwein 1988 with a line search that
     never lets the energy grow [Exl et al. 2014, which mumax3 uses]. The descent follows a valley: it finds the minimum

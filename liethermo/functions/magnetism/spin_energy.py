@@ -17,8 +17,8 @@ from manifolds.structures.spins import (
 from manifolds.structures.spins import (
     VectorComponents,
     reshape_vectors,
-    spins_from_state,
-    state_from_spins,
+    spin_components_from_state,
+    state_from_spin_components,
 )
 
 from ...errors import InputError
@@ -73,12 +73,14 @@ class SpinEnergy(Energy):
 
 def lattice_spins(x, sites: tuple[int, ...], planar: bool = False) -> VectorComponents:
     """Return the components of the spins of a state, each of the shape of the sites."""
-    return reshape_vectors(spins_from_state(x, math.prod(sites), planar), sites)
+    return reshape_vectors(spin_components_from_state(x, math.prod(sites), planar), sites)
 
 
 def flatten_covectors(covectors: VectorComponents, x, planar: bool = False) -> jax.Array:
     """Return covectors of the spins as one covector of the state x."""
-    return state_from_spins(reshape_vectors(covectors, (-1,)), jnp.zeros(x.size - 3 * covectors[0].size), planar)
+    return state_from_spin_components(
+        reshape_vectors(covectors, (-1,)), jnp.zeros(x.size - 3 * covectors[0].size), planar
+    )
 
 
 def lattice_shape(sites) -> tuple[int, ...]:

@@ -405,7 +405,7 @@ def _step_energies(method: VariationalIntegrator, system: SimpleClosedSystem, h,
 
 @jit_cached
 def _regularity_matrix(discrete: DiscreteSystem, q0, q1, S0, S1):
-    """Return the Jacobian (3.13) of momentum and constraint, shape (n + 1, n + 1), by a compiled program."""
+    """Return the Jacobian of the momentum and constraint by (q_1, S_1), (3.13) of the paper, shape (n + 1, n + 1)."""
     return discrete.momentum_and_constraint_jacobian(q0, q1, S0, S1)
 
 

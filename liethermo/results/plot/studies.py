@@ -143,8 +143,8 @@ def _set_axis(ax: Axes, letter: str, coordinate: xarray.DataArray, points: np.nd
     axis.set_label_text(_label(coordinate))
 
 
-def _colour_map(values: np.ndarray) -> dict[str, Any]:
-    """Return a colour map of even lightness, with one colour for each class if the values are classes."""
+def _colour_options(values: np.ndarray) -> dict[str, Any]:
+    """Return plot options: a colour map of even lightness, with one colour for each class if the values are classes."""
     distinct_values = np.unique(values[np.isfinite(values)])
     if 0 < len(distinct_values) <= MAX_CLASSES and (distinct_values == np.round(distinct_values)).all():
         classes = np.arange(distinct_values.min(), distinct_values.max() + 2) - 0.5
@@ -158,7 +158,7 @@ def _draw_map(ax: Axes, values: xarray.DataArray, failed: xarray.DataArray, cont
     rows, columns = np.argsort(y), np.argsort(x)
     y, x, z = y[rows], x[columns], values.to_numpy()[np.ix_(rows, columns)]
     is_failed = failed.to_numpy()[np.ix_(rows, columns)]
-    colours, masked_values = _colour_map(z), np.ma.masked_invalid(np.where(is_failed, np.nan, z))
+    colours, masked_values = _colour_options(z), np.ma.masked_invalid(np.where(is_failed, np.nan, z))
     mesh = ax.pcolormesh(_cell_edges(x), _cell_edges(y), masked_values, rasterized=True, **colours)
     bar = ax.figure.colorbar(mesh, ax=ax, label=_label(values))
     if "norm" in colours:
@@ -219,7 +219,7 @@ def _draw_points(
     ax: Axes, values: xarray.DataArray, failed: xarray.DataArray, x: xarray.DataArray, y: xarray.DataArray
 ) -> None:
     z, is_failed = values.to_numpy(), failed.to_numpy()
-    colours = _colour_map(z[~is_failed])
+    colours = _colour_options(z[~is_failed])
     is_drawn = ~is_failed & np.isfinite(z)
     points = ax.scatter(x.to_numpy()[is_drawn], y.to_numpy()[is_drawn], c=z[is_drawn], s=14, linewidth=0, **colours)
     ax.figure.colorbar(points, ax=ax, label=_label(values))

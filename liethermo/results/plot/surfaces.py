@@ -225,7 +225,7 @@ class _LevelSurface:
     def __init__(self, function: PointFunction, point: np.ndarray, size: float):
         self.function, self.level, self.extent = function, float(function(point)), size
         self.radii = np.append(0.0, np.geomspace(0.01 * size, 10.0 * size, 60))
-        meetings = self._ray_crossings(sphere_grid(16, 32)).sum(axis=0)
+        meetings = self._ray_crossings(unit_sphere_grid(16, 32)).sum(axis=0)
         self.is_simple, self.is_closed = bool(meetings.max() == 1), bool((meetings == 1).all())
 
     def intersect_rays(self, directions: np.ndarray) -> np.ndarray:
@@ -270,7 +270,7 @@ class _Scene:
         if not surface.is_closed:
             self.draw_level_surface(function, 0, GREY, label)
             return
-        self.solid, self.mesh = surface, surface.intersect_rays(sphere_grid(96, 192))
+        self.solid, self.mesh = surface, surface.intersect_rays(unit_sphere_grid(96, 192))
         normals = np.cross(np.gradient(self.mesh, axis=0), np.gradient(self.mesh, axis=1))
         normals[[0, -1]] = normals[[1, -2]]  # the normals vanish at the poles of the mesh
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -349,9 +349,11 @@ def _draw_trajectory(solution: Solution, scene: _Scene) -> None:
     scene.ax.figure.colorbar(ScalarMappable(scale, TIME_COLORMAP), ax=scene.ax, **bar)
 
 
-def sphere_grid(rows: int, columns: int) -> np.ndarray:
-    """Return unit vectors by latitude and longitude, shape (rows + 1, columns + 1, 3)."""
-    theta, phi = np.meshgrid(np.linspace(0, np.pi, rows + 1), np.linspace(0, 2 * np.pi, columns + 1), indexing="ij")
+def unit_sphere_grid(latitude_cells: int, longitude_cells: int) -> np.ndarray:
+    """Return unit vectors by latitude and longitude, shape (latitude_cells + 1, longitude_cells + 1, 3)."""
+    theta, phi = np.meshgrid(
+        np.linspace(0, np.pi, latitude_cells + 1), np.linspace(0, 2 * np.pi, longitude_cells + 1), indexing="ij"
+    )
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
 
 
@@ -473,7 +475,7 @@ def bloch_ball(
         ax = plt.figure(figsize=(4.6, 4.6), dpi=DPI, layout="constrained").add_subplot(projection="3d")
     elif not isinstance(ax, Axes3D):
         raise InputError('ax must be made with projection="3d"')
-    x, y, z = np.moveaxis(sphere_grid(24, 36), -1, 0)
+    x, y, z = np.moveaxis(unit_sphere_grid(24, 36), -1, 0)
     ax.plot_wireframe(x, y, z, rstride=2, cstride=2, color=GREY, alpha=0.25, linewidth=0.4)
     angle = np.linspace(0.0, 2.0 * np.pi, 181)
     ax.plot(np.cos(angle), np.sin(angle), np.zeros_like(angle), color=GREY, linewidth=0.6)

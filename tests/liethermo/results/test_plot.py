@@ -14,7 +14,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 import liethermo as lt
 import manifolds as mf
 from liethermo.results.plot.figures import BLUE, GREEN, GREY, RED
-from liethermo.results.plot.surfaces import _fit_quadric, _LevelSurface, sphere_grid
+from liethermo.results.plot.surfaces import _fit_quadric, _LevelSurface, unit_sphere_grid
 
 matplotlib.use("Agg")
 
@@ -181,7 +181,7 @@ def test_momentum_sphere_of_a_loaded_solution(body, relaxed_solution, tmp_path):
 
 def test_the_energy_surface_is_found_from_the_states(body, relaxed_solution):
     surface_points = _LevelSurface(_fit_quadric(relaxed_solution.x), relaxed_solution.x[0], 1.0).intersect_rays(
-        sphere_grid(8, 16)
+        unit_sphere_grid(8, 16)
     )
     np.testing.assert_allclose(body.energy(surface_points), relaxed_solution.energy[0], rtol=1e-9)
 

@@ -9,7 +9,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines import adaptive_steps
-from liethermo.engines.root_bracket import values_of_first_event_function_at_step_ends
+from liethermo.engines.root_bracket import combined_event_values_at_step_ends
 from tests.cases import few_combinations
 from tests.systems import oscillator, rigid_body
 
@@ -407,9 +407,8 @@ def test_files_have_the_events(tmp_path):
 
 
 def test_event_functions_that_are_nan_at_the_end_of_a_step_have_no_event_in_it():
-    start, end = values_of_first_event_function_at_step_ends((0, 0), jnp.array([1.0, 2.0]), jnp.array([jnp.nan, -1.0]))
+    start, end = combined_event_values_at_step_ends((0, 0), jnp.array([1.0, 2.0]), jnp.array([jnp.nan, -1.0]))
     assert (float(start), float(end)) == (1.0, -0.5)  # the second function, divided by its value at the start
     assert (
-        float(values_of_first_event_function_at_step_ends((0, 0), jnp.array([1.0, 2.0]), jnp.array([jnp.nan, 0.5]))[1])
-        == 0.25
+        float(combined_event_values_at_step_ends((0, 0), jnp.array([1.0, 2.0]), jnp.array([jnp.nan, 0.5]))[1]) == 0.25
     )
