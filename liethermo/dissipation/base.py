@@ -67,11 +67,15 @@ class Dissipation(Module):
         """True for an external action without friction, to which no noise belongs."""
         return False
 
-    def couplings(self, system: Geometry) -> scipy.sparse.csr_array | None:
+    def force_pattern(self, system: Geometry) -> scipy.sparse.csr_array | None:
         """Return the pattern, shape (n, n), of the state and gradient components that each force component depends on.
 
         Systems too large for a full Jacobian matrix use it. None if the pattern is not known.
         """
+        return self.couplings(system)
+
+    def couplings(self, system: Geometry) -> scipy.sparse.csr_array | None:
+        """Return None; a subclass may define :meth:`force_pattern` by this name, which it had in 0.2."""
         return None
 
     @property
@@ -235,8 +239,8 @@ class DissipationSum(Dissipation):
     def is_symmetric(self) -> bool:
         return all(part.is_symmetric for part in self.parts)
 
-    def couplings(self, system):
-        return union_pattern(part.couplings(system) for part in self.parts)
+    def force_pattern(self, system):
+        return union_pattern(part.force_pattern(system) for part in self.parts)
 
     @property
     def preserves_casimirs(self) -> bool:

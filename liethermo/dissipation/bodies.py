@@ -104,7 +104,7 @@ class HeatConduction(Dissipation):
 
         return Factor(len(i), times)
 
-    def couplings(self, system):
+    def force_pattern(self, system):
         if self.laws:
             return None  # the laws may depend on all components
         S = self.entropy_indices(system)
@@ -155,7 +155,7 @@ class LinearFriction(Dissipation):
         p, S = indices.p[numbers], indices.S[indices.owner[numbers]]
         return p, S, R, dH[p], _nan_unless_positive(dH[S])
 
-    def couplings(self, system):
+    def force_pattern(self, system):
         return _same_body_pattern(_state_indices(system), system.dim)
 
 
@@ -203,7 +203,7 @@ class Drag(Dissipation):
         weight = self.coefficient[edge] * (2.0 * T_i * T_j / (T_i + T_j))
         return (p_i, p_j, S_i, S_j), (T_i, T_j, w), weight, force_from_flux
 
-    def couplings(self, system):
+    def force_pattern(self, system):
         indices = _state_indices(system)
         i, j, _ = _momentum_and_edge_indices(self.first_bodies, self.second_bodies, indices)
         S_i, S_j = indices.S[indices.owner[i]], indices.S[indices.owner[j]]
@@ -231,7 +231,7 @@ class ContactFriction(SkewFriction):
         p, S = indices.p[numbers], indices.S[indices.owner[numbers]]
         return jnp.zeros_like(x).at[p].add(-x[p] * dH[S]).at[S].add(x[p] * dH[p])
 
-    def couplings(self, system):
+    def force_pattern(self, system):
         return _same_body_pattern(_state_indices(system), system.dim)
 
 

@@ -80,7 +80,7 @@ class DissipationPotential(Dissipation):
 
     preserves_casimirs = forward_to("of")
     preserve = forward_to("of")
-    couplings = forward_to("of")
+    force_pattern = forward_to("of")
 
     def bind_to(self, system):
         bound_potential = eqx.tree_at(lambda d: d.of, self, self.of.bind_to(system))

@@ -69,7 +69,7 @@ class BathEnergy(Energy):
         """Inverse heat capacities 1 / C, shape (m,): the relative change of a temperature per entropy."""
         return 1.0 / self.capacity
 
-    def couplings(self, dim: int) -> scipy.sparse.csr_array:
+    def hessian_pattern(self, dim: int) -> scipy.sparse.csr_array:
         return sparsity_pattern(range(dim), range(dim), dim)
 
 
@@ -269,8 +269,8 @@ class BodyBathsEnergy(Energy):
 
         return jnp.concatenate([energy_stage_gradients(*pair) for pair in self._energies_and_components], axis=1)
 
-    def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
-        body, baths = self.body.couplings(self.body_dim), self.baths.couplings(dim - self.body_dim)
+    def hessian_pattern(self, dim: int) -> scipy.sparse.csr_array | None:
+        body, baths = self.body.hessian_pattern(self.body_dim), self.baths.hessian_pattern(dim - self.body_dim)
         if body is None or baths is None:
             return None
         return pattern_of_matrix(scipy.sparse.block_diag([body, baths]))

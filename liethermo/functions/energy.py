@@ -69,7 +69,7 @@ def _evaluate_into_buffer(function: Callable, x) -> jax.Array:
 
 
 MAX_CLIQUE_COMPONENTS = 2_000
-"""Largest number of components of a term for which :meth:`Energy.couplings` makes a dense block of its pattern."""
+"""Largest number of components of a term whose block in :meth:`Energy.hessian_pattern` is dense."""
 
 
 class Energy(Module):
@@ -151,11 +151,15 @@ class Energy(Module):
         """
         return ChartEnergy(self, coordinates, space, start)
 
-    def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
+    def hessian_pattern(self, dim: int) -> scipy.sparse.csr_array | None:
         """Return the sparsity pattern of the Hessian, or None if it is unknown.
 
         The discrete gradients have the same pattern.
         """
+        return self.couplings(dim)
+
+    def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
+        """Return None; a subclass may define :meth:`hessian_pattern` by this name, which it had in 0.2."""
         return None
 
     def check_components(self, dim: int, role: str) -> None:
@@ -297,7 +301,7 @@ class Quadratic(Energy):
         matrix_vector_product = self.apply_matrix(float64_array(x))
         return matrix_vector_product if self.b is None else matrix_vector_product + self.b
 
-    def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
+    def hessian_pattern(self, dim: int) -> scipy.sparse.csr_array | None:
         if is_traced(self.A):
             return None
         indices = np.nonzero(np.asarray(self.A))
@@ -328,7 +332,7 @@ class Linear(Energy):
     def gradient(self, x) -> jax.Array:
         return self.b
 
-    def couplings(self, dim: int) -> scipy.sparse.csr_array:
+    def hessian_pattern(self, dim: int) -> scipy.sparse.csr_array:
         return sparsity_pattern([], [], dim)
 
     def __neg__(self) -> Energy:
@@ -547,7 +551,7 @@ class Pullback(Energy):
         path, pull_back = path.path_and_pullback_in(self.coordinates)
         return pull_back(self.term.stage_gradients(scheme, path))
 
-    def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
+    def hessian_pattern(self, dim: int) -> scipy.sparse.csr_array | None:
         if not isinstance(self.coordinates, Components) or len(self.coordinates.indices) > MAX_CLIQUE_COMPONENTS:
             return None
         return clique_pattern([np.asarray(self.coordinates.indices) % dim], dim)
@@ -591,7 +595,7 @@ class Negative(Energy):
     def stage_gradients(self, scheme, path) -> jax.Array:
         return -self.term.stage_gradients(scheme, path)
 
-    couplings = forward_to("term")
+    hessian_pattern = forward_to("term")
     check_components = forward_to("term")
     flattened_states = forward_to("term")
 
@@ -620,7 +624,7 @@ class Multiple(Energy):
     def stage_gradients(self, scheme, path) -> jax.Array:
         return self.factor * self.term.stage_gradients(scheme, path)
 
-    couplings = forward_to("term")
+    hessian_pattern = forward_to("term")
     check_components = forward_to("term")
     flattened_states = forward_to("term")
 
@@ -656,8 +660,8 @@ class Sum(Energy):
     def at_time(self, t) -> Energy:
         return Sum(tuple(term.at_time(t) for term in self.summands))
 
-    def couplings(self, dim: int) -> scipy.sparse.csr_array | None:
-        return union_pattern(term.couplings(dim) for term in self.summands)
+    def hessian_pattern(self, dim: int) -> scipy.sparse.csr_array | None:
+        return union_pattern(term.hessian_pattern(dim) for term in self.summands)
 
     def flattened_states(self, x) -> jax.Array:
         for term in self.summands:

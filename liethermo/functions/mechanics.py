@@ -123,7 +123,7 @@ class Each(Energy):
         gradients = jax.vmap(summand_stage_gradients, in_axes=mapped_axes, out_axes=1)(summand_paths, *self.parameters)
         return jax.vmap(lambda g: self._scatter_gradients(g, path.start.shape[0]))(gradients)
 
-    def couplings(self, dim: int) -> scipy.sparse.csr_array:
+    def hessian_pattern(self, dim: int) -> scipy.sparse.csr_array:
         return clique_pattern(self.places, dim)
 
     def check_components(self, dim: int, role: str) -> None:

@@ -238,7 +238,7 @@ class CrystalBondEnergy(SpinEnergy):
         """
         return value if value.ndim == n_trailing_axes else jnp.roll(value, offset, axis=tuple(range(len(self.cells))))
 
-    def couplings(self, dim: int) -> scipy.sparse.csr_array:
+    def hessian_pattern(self, dim: int) -> scipy.sparse.csr_array:
         atoms = self.sites[-1] if self._has_basis else 1
         numbers = np.arange(int(np.prod(self.cells))).reshape(self.cells)
         members = []

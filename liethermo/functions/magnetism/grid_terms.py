@@ -173,7 +173,7 @@ class BondEnergy(SpinEnergy):
         J, D = (None if value is None else factor * value for value in (self.J, self.D))
         return BondEnergy(self.sites, self.offset, J, D)
 
-    def couplings(self, dim: int) -> scipy.sparse.csr_array:
+    def hessian_pattern(self, dim: int) -> scipy.sparse.csr_array:
         site_numbers = np.arange(math.prod(self.sites)).reshape(self.sites)
         neighbour_numbers = np.roll(site_numbers, [-shift for shift in self.offset], axis=range(site_numbers.ndim))
         return clique_pattern(bond_component_indices(site_numbers.ravel(), neighbour_numbers.ravel()), dim)

@@ -333,7 +333,7 @@ class QuadraticSiteEnergy(SpinEnergy):
         n = split_vectors(self.n)
         return scale_vectors(self.A * dot_vectors(n, spins), n)
 
-    def couplings(self, dim: int) -> scipy.sparse.csr_array:
+    def hessian_pattern(self, dim: int) -> scipy.sparse.csr_array:
         return clique_pattern(np.arange(3 * math.prod(self.sites)).reshape(-1, 3), dim)
 
     def multiple(self, factor) -> Energy:
@@ -406,7 +406,7 @@ class SitePolynomial(SpinEnergy):
     def multiple(self, factor) -> Energy:
         return SitePolynomial(self.sites, self.powers, tuple(factor * c for c in self.coefficients), self.frame)
 
-    def couplings(self, dim: int) -> scipy.sparse.csr_array:
+    def hessian_pattern(self, dim: int) -> scipy.sparse.csr_array:
         return clique_pattern(np.arange(3 * math.prod(self.sites)).reshape(-1, 3), dim)
 
 

@@ -224,8 +224,11 @@ class ComposedSystem(System):
     def _find_pattern(self) -> scipy.sparse.csr_array | None:
         if self.poisson.species:
             return None
-        patterns = (term.couplings(self) for term in self.total_dissipation.terms)
-        operator, hessian = union_pattern([_poisson_pattern(self.poisson), *patterns]), self.energy.couplings(self.dim)
+        patterns = (term.force_pattern(self) for term in self.total_dissipation.terms)
+        operator, hessian = (
+            union_pattern([_poisson_pattern(self.poisson), *patterns]),
+            self.energy.hessian_pattern(self.dim),
+        )
         if operator is None or hessian is None:
             return None
         identity = scipy.sparse.eye_array(self.dim, dtype=bool, format="csr")

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import liethermo as lt
+import manifolds as mf
 from liethermo.engines import sparse_engine
 from liethermo.functions.gradients import DISCRETE_GRADIENTS, discrete_gradients_at_stages
 from liethermo.integrators.tableaus import gauss_tableau
@@ -251,6 +252,34 @@ def test_other_ways_to_run_it():
     adaptive = lt.integrate(system, x0, (0.0, 1.0), lt.Adaptive(1e-4), save_at=[0.5], engine="sparse")
     assert adaptive.t.tolist() == [0.0, 0.5, 1.0]
     assert_both_laws(adaptive)
+
+
+class EnergyOf02(lt.Energy):
+    """An energy written for version 0.2, where the pattern of the Hessian was named ``couplings``."""
+
+    def value(self, x):
+        return x[0] * x[1]
+
+    def couplings(self, dim):
+        return scipy.sparse.csr_array(([True, True], ([0, 1], [1, 0])), (dim, dim))
+
+
+class FrictionOf02(lt.Dissipation):
+    """A friction written for version 0.2, where the pattern of the force was named ``couplings``."""
+
+    def force(self, system, x, dH, dS, dL):
+        return -dH
+
+    def couplings(self, system):
+        return scipy.sparse.eye_array(system.dim, dtype=bool, format="csr")
+
+
+def test_patterns_with_their_names_of_02_are_used():
+    energy = lt.Quadratic([0.0, 0.0, 1.0]) + EnergyOf02()
+    np.testing.assert_array_equal(energy.hessian_pattern(3).toarray(), [[0, 1, 0], [1, 0, 0], [0, 0, 1]])
+    system = lt.MetriplecticSystem(mf.NoPoisson(3), energy)
+    np.testing.assert_array_equal((FrictionOf02() + FrictionOf02()).force_pattern(system).toarray(), np.eye(3))
+    assert (FrictionOf02() + lt.Friction(np.eye(3))).force_pattern(system) is None
 
 
 def test_the_sparse_engine_needs_a_sparsity():

@@ -114,7 +114,7 @@ def test_energies_are_the_sums_over_their_edges(name):
     assert energy.is_quadratic
     assert float(energy.value(x)) == pytest.approx(float(value), abs=1e-13)
     np.testing.assert_allclose(energy.gradient(x), gradient, atol=1e-13)
-    pattern = energy.couplings(37).toarray()
+    pattern = energy.hessian_pattern(37).toarray()
     hessian = np.asarray(jax.jacfwd(energy.gradient)(x))
     assert not hessian[~pattern].any()
 
