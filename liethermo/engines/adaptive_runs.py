@@ -283,11 +283,11 @@ class PauseHandler:
         return np.flatnonzero(self.adaptive_runs.read("status") == reason)
 
     def end_or_resume_at_sign_changes(self) -> None:
-        """Decide for each trajectory paused at a sign change whether it is an event: a zero, to rounding.
+        """End or resume each trajectory that is paused at a sign change of an event function.
 
-        The run ends at the last zero that it waits for. Otherwise it resumes, as it does after a jump or a pole. If a
-        function is NaN between the two signs, it is unknown whether the event happens, and the run ends, unless jumps
-        count as events.
+        A zero, to rounding, is an event, and so is a jump or a pole if jumps count as events. The run ends at the last
+        event that it waits for; otherwise it resumes. If a function is NaN between the two signs, it is unknown whether
+        the event happens, and the run ends, unless jumps count as events.
         """
         runs, indices = self.adaptive_runs, self.paused_indices(StatusCode.PAUSED_AT_EVENT)
         if not indices.size:

@@ -171,7 +171,7 @@ class OneStepMethod(Module):
         return jax.linearize(lambda k: self.slopes(system, x, compensation, h, k) - k, k)[1]
 
     def why_step_failed(self, system: System, x, k, h) -> str:
-        """Explain why the step from x is not finite, or return ""; k are the slopes of the previous step."""
+        """Return why the step from x is not finite, as a text, or ""; k are the slopes of the previous step."""
         return ""
 
     # -- and of what it runs on ---------------------------------------------------------------------------------------

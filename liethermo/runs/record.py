@@ -338,16 +338,16 @@ class GroupRecord:
         record.iterations[rows] = final["fixed_point_iterations"] + final["newton_iterations"]
         if n_rejected is not None:
             record.rejected[rows] = n_rejected
-        self._explain_failures(members, final["x"], status, end_time)
+        self._store_failure_reasons(members, final["x"], status, end_time)
         if record.x is not None:
             record.x[rows] = final["x"]
         if record.clock is not None and record.work is not None:
             record.work[rows] = record.clock.work(final["x"])
 
-    def _explain_failures(
+    def _store_failure_reasons(
         self, members: MemberSelection, x: np.ndarray, status: np.ndarray, end_time: np.ndarray
     ) -> None:
-        """Store failure messages of trajectories that grow without bound, for the first failures at least."""
+        """Store a message for each trajectory that grows without bound, among the first ones that fail."""
         status, end_time = (np.broadcast_to(a, len(x)) for a in (status, end_time))
         failed_rows = np.flatnonzero(np.isin(status, FAILURE_CODES))[
             : max(0, MAX_EXPLAINED_FAILURES - len(self.record.failure_reasons))

@@ -313,7 +313,7 @@ class QuantumSystem(System):
                 f"its density matrix has the eigenvalue {min_eigenvalue:.3g}, outside the cone of positive matrices: "
                 "a shorter step stays inside"
             )
-        return self._explain_rank_growth(np.atleast_2d(x), rho) if self._has_dissipation(SteepestEntropyAscent) else ""
+        return self._why_rank_grows(np.atleast_2d(x), rho) if self._has_dissipation(SteepestEntropyAscent) else ""
 
     def run_conditions(self, x, t, guarantees):
         rho = self._density_matrices(x)
@@ -333,8 +333,8 @@ class QuantumSystem(System):
             conditions.append(RunCondition(ADIABATIC_ROW, parameter, ADIABATIC_LIMIT, is_slow, note, True))
         return tuple(conditions)
 
-    def _explain_rank_growth(self, x: np.ndarray, rho: np.ndarray) -> str:
-        """Explain why eigenvalues zero would not stay zero under steepest ascent; "" if they do."""
+    def _why_rank_grows(self, x: np.ndarray, rho: np.ndarray) -> str:
+        """Return why zero eigenvalues would not stay zero under steepest ascent, as a text; "" if they stay zero."""
         kernels = self._kernels(rho)
         use = [i for i, kernel in enumerate(kernels) if kernel.size]
         turned = [self._is_kernel_rotated(rho[i], kernels[i]) for i in use]

@@ -76,7 +76,7 @@ def read_machine_code(name: str, suffix: str = ".o") -> bytes | None:
             file_status = os.fstat(file.fileno())
             if not stat.S_ISREG(file_status.st_mode) or file_status.st_size > MAX_FILE_BYTES:
                 return None
-            if reason := _why_others_may_write(file_status):
+            if reason := _why_untrusted(file_status):
                 _warn_untrusted(str(folder / f"{name}{suffix}"), reason)
                 return None
             content = file.read()
@@ -111,15 +111,15 @@ def _trusted_cache_folder() -> Path | None:
         _warn_untrusted(str(folder), "it is a link")
     elif not stat.S_ISDIR(folder_status.st_mode):
         _warn_untrusted(str(folder), "it is not a folder")
-    elif reason := _why_others_may_write(folder_status):
+    elif reason := _why_untrusted(folder_status):
         _warn_untrusted(str(folder), reason)
     else:
         return folder
     return None
 
 
-def _why_others_may_write(status: os.stat_result) -> str:
-    """Return why a file or folder may be another user's; empty if it is this user's alone."""
+def _why_untrusted(status: os.stat_result) -> str:
+    """Return why a file or folder cannot be trusted, as a text; "" if only this user owns and writes it."""
     if not hasattr(os, "geteuid"):
         return ""
     if status.st_uid != os.geteuid():

@@ -381,7 +381,7 @@ class Space(SpaceMaps):
             batch = value.shape[: value.ndim - n_core_axes]
             x, y = (np.asarray(jnp.broadcast_to(a, (*batch, *self.shape))[index]) for a in (x, y))
             raise DomainError(
-                f"{self.name}: {map_name}(x, y){format_index(index)} is not defined: {self._explain_missing_log(x, y)}"
+                f"{self.name}: {map_name}(x, y){format_index(index)} is not defined: {self._why_log_is_undefined(x, y)}"
             )
 
     # -- helpers --------------------------------------------------------------------------------------------------

@@ -230,7 +230,7 @@ class Sphere(Space):
         z = _dot(v, v)
         return u - _dot(v, u) * (stumpff(2, z) * v + stumpff(1, z) * x)
 
-    def _explain_missing_log(self, x, y):
+    def _why_log_is_undefined(self, x, y):
         gap = float(jnp.sqrt(((x + y) ** 2).sum()))
         return (
             f"y is within {gap:.2g} of the antipode of x (margin {MIN_CUT_ANGLE:.1e}), to which every direction "

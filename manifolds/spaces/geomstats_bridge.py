@@ -171,7 +171,7 @@ class GeomstatsSpace(Space):
         radius = self._call_kernel("radius", x) if self._injectivity_radii is None else self._injectivity_radii
         return self._norm(x, v) / radius
 
-    def _explain_missing_log(self, x, y):
+    def _why_log_is_undefined(self, x, y):
         return (
             "geomstats found no logarithm, or one that its own exponential map does not lead back from, or one not "
             f"within the injectivity radius {self.injectivity_radius(x):.6g}; go by a point between them"

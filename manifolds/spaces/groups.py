@@ -232,7 +232,7 @@ class GroupSpace(Space):
     def _transport(self, x, v, u):
         return self._left_translate(x, self._group_exp(x, v), u)
 
-    def _explain_missing_log(self, x, y):
+    def _why_log_is_undefined(self, x, y):
         return f"x^-1 y {self.group._why_not_in_domain(np.asarray(self._relative_element(x, y)))}"
 
 
@@ -516,8 +516,8 @@ class SpecialEuclidean(GroupSpace):
         top = jnp.concatenate([jnp.broadcast_to(a, (*batch, *a.shape[-2:])) for a in (rotation, translation)], axis=-1)
         return jnp.concatenate([top, jnp.zeros_like(top[..., :1, :])], axis=-2)
 
-    def _explain_missing_log(self, x, y):
-        return self.rotations._explain_missing_log(x[:-1, :-1], y[:-1, :-1])
+    def _why_log_is_undefined(self, x, y):
+        return self.rotations._why_log_is_undefined(x[:-1, :-1], y[:-1, :-1])
 
 
 def _nearest_rotation(x):

@@ -301,7 +301,7 @@ class SpaceMaps(metaclass=ListedABCMeta):
     def _inverse_cayley(self, x, y):
         return self._group_exp(x, y)  # raises
 
-    def _explain_missing_log(self, x, y) -> str:
+    def _why_log_is_undefined(self, x, y) -> str:
         """Return the reason why ``log(x, y)`` is NaN, for one pair of NumPy arrays."""
         if not self.has_geodesics:
             return "the chart around x does not reach y; go by a point between them"

@@ -255,10 +255,10 @@ class Product(Space):
     def _inverse_cayley(self, x, y):
         return self._apply_and_join("_inverse_cayley", x, y)
 
-    def _explain_missing_log(self, x, y):
+    def _why_log_is_undefined(self, x, y):
         for i, (factor, *pair) in enumerate(zip(self.factors, self.split(x), self.split(y), strict=True)):
             if not np.isfinite(factor._log(*pair)).all():
-                return f"in factor {i}, {factor.name}, {factor._explain_missing_log(*map(np.asarray, pair))}"
+                return f"in factor {i}, {factor.name}, {factor._why_log_is_undefined(*map(np.asarray, pair))}"
         raise AssertionError("the logarithm is defined in every factor")
 
 
@@ -402,10 +402,10 @@ class Power(Space):
     _cayley = forward_to("base")
     _inverse_cayley = forward_to("base")
 
-    def _explain_missing_log(self, x, y):
+    def _why_log_is_undefined(self, x, y):
         is_undefined = ~np.isfinite(np.asarray(self.base._log(x, y))).reshape(self.count, -1).all(axis=1)
         i = int(is_undefined.argmax())
-        return f"in copy {i}, {self.base._explain_missing_log(x[i], y[i])}"
+        return f"in copy {i}, {self.base._why_log_is_undefined(x[i], y[i])}"
 
 
 register((Sphere(2), Euclidean(3)), (SpecialOrthogonal(3), Euclidean(3)))(Product)

@@ -414,7 +414,7 @@ class Grassmann(Space):
         rotation = expm(_commutator(v, x))
         return symmetrize(rotation @ u @ rotation.swapaxes(-1, -2))
 
-    def _explain_missing_log(self, x, y):
+    def _why_log_is_undefined(self, x, y):
         return "the subspaces have a right angle between them, and more than one geodesic leads from x to y"
 
 
