@@ -103,8 +103,7 @@ class Dissipation(Module):
 
     @property
     def can_drive_baths(self) -> bool:
-        """True if its states are those of the body followed by bath entropies; the body has then no entropy of its
-        own."""
+        """True if the dissipation acts on states of a body followed by bath entropies; the body then has no entropy."""
         return False
 
     @property
@@ -167,7 +166,8 @@ class Dissipation(Module):
         """Return a factor B with ``B B^T = K``, where the force is K dS, or None if there is no factor.
 
         If a dissipation lowers the energy, the force is ``-K dH``. Noise and potentials of forces are made with B. For
-        any gradients passed, ``B^T dH = 0`` if the energy is conserved, and ``B^T dL = 0``.
+        any gradients passed, ``B^T dH = 0`` if the energy is conserved, and ``B^T dL = 0`` for each gradient dL of a
+        preserved function.
         """
         return None
 
@@ -365,7 +365,7 @@ class LiftedGeometry(NamedTuple):
         return cls(system, x[:n], lambda alpha: alpha[:n], lambda v: jnp.pad(v, (0, n_extra)), True)
 
     def inner_gradients(self, dH, dS, dL) -> tuple:
-        """Return the inner gradients; dS may be None."""
+        """Return the gradients of energy, entropy and preserved functions in the inner system; dS may be None."""
         return self.lift(dH), None if dS is None else self.lift(dS), tuple(map(self.lift, dL))
 
 

@@ -150,7 +150,7 @@ def system_and_state_at_step_start(system: System, x, energy_before) -> tuple[Sy
         The energy at the end of the last step, before a jump.
     """
     step_system = system_of_step(system, x)
-    if system.clock is not None and system.clock.energy_jumps:
+    if system.clock is not None and system.clock.can_energy_jump:
         x = add_jump_of_energy(system.clock, x, step_system.energy.value(x) - energy_before)
     return step_system, x
 

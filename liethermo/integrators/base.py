@@ -102,7 +102,11 @@ class OneStepMethod(Module):
 
     @abstractmethod
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
-        """Return the right-hand side of the stage equations, shape (stages, n), for a step h from x + compensation."""
+        """Return the right-hand side of the stage equations at the slopes k, shape (stages, n).
+
+        The step has the size h and starts at x + compensation. Solved slopes are equal to this result, and the slopes
+        of an explicit method are the result for any k.
+        """
 
     @abstractmethod
     def increment(self, h, k) -> jax.Array:

@@ -88,7 +88,7 @@ def replace_parameters(system: System, values: Mapping[str, Any]) -> System:
         array = host_array(real_array(value))
         if array.shape != parameter.value.shape:
             raise InputError(f"{name} must have shape {parameter.value.shape}, got {array.shape}")
-        _note_given_name(replaced, name, parameter)
+        _check_and_record_name(replaced, name, parameter)
         for i in parameter.leaves:
             leaves[i] = real_array(parameter.to_leaf(array))
             if i in conditions:
@@ -185,7 +185,7 @@ def arrays_with_members(system: System, values: Mapping[str, Any]) -> list[np.nd
         if array.ndim == 0 or array.shape[1:] != parameter.value.shape:
             expected_shape = ", ".join(["trajectories", *map(str, parameter.value.shape)])
             raise InputError(f"the values of {name} must have shape ({expected_shape}), got {array.shape}")
-        _note_given_name(replaced, name, parameter)
+        _check_and_record_name(replaced, name, parameter)
         for i in parameter.leaves:
             leaves[i] = np.asarray(parameter.to_leaf(array))
     return leaves
@@ -215,8 +215,8 @@ def lookup_parameter(system: System, name: str) -> NamedParameter | None:
     return by_name.get(name) or by_path.get(name)
 
 
-def _note_given_name(replaced: dict[int, str], name: str, parameter: NamedParameter) -> None:
-    """Raise InputError if the parameter was given before under another name, and note its name otherwise."""
+def _check_and_record_name(replaced: dict[int, str], name: str, parameter: NamedParameter) -> None:
+    """Raise InputError if the parameter was given before under another name; otherwise record its name."""
     for i in parameter.leaves:
         if i in replaced:
             raise InputError(f"{name} and {replaced[i]} are the same parameter. Give one of them")

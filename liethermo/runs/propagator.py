@@ -320,7 +320,7 @@ class Propagator(metaclass=ListedType):
             The function takes these parameters from it at each call.
         """
         problem = self._problem_of_final
-        if problem is None or (varied is not None and not varied.select_program(problem)):
+        if problem is None or (varied is not None and not varied.is_program_determined_by_key(problem)):
             return None
         start, end = checked_span(t_span)
         h = checked_step(self.step, start, end)

@@ -255,7 +255,7 @@ class Run:
             x, n_evaluations = np.concatenate([x, states[1:]]), n_evaluations + n
             if message or was_interrupted or len(states) <= last - first:
                 break
-            energy = system.energy.value(x[-1]) if clock is not None and clock.energy_jumps else energy
+            energy = system.energy.value(x[-1]) if clock is not None and clock.can_energy_jump else energy
         return x, n_evaluations, message, was_interrupted
 
     def _energies_and_entropies(self, x: np.ndarray) -> np.ndarray:

@@ -310,7 +310,7 @@ class Family:
 
     @property
     def is_per_trajectory(self) -> np.ndarray:
-        """Mask of the parameters that differ between members, shape (p,), all arrays one after another."""
+        """Mask of the entries of the joined parameter arrays that differ between members, shape (p,)."""
         return np.concatenate(
             [np.zeros(0, bool), *(np.full(value[0].size, has_axis) for value, has_axis in self._arrays_with_axis_flags)]
         )

@@ -117,7 +117,7 @@ class VariedParameters:
                 return None
         return (self.entries == 0.0).tobytes(), *self._codes
 
-    def select_program(self, problem: Problem) -> bool:
+    def is_program_determined_by_key(self, problem: Problem) -> bool:
         """Return whether the code of a problem depends on the parameters by :meth:`program_key` alone.
 
         Parameters

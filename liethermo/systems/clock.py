@@ -41,7 +41,7 @@ class Clock(Module):
     n_last_counters: int = eqx.field(static=True, default=0)
 
     @property
-    def energy_jumps(self) -> bool:
+    def can_energy_jump(self) -> bool:
         """True if the energy may jump at a break of the span."""
         return bool(self.span.breaks.size) and self.energy_depends_on_time
 

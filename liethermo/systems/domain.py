@@ -9,8 +9,8 @@ from typing import Any
 import jax
 
 
-def _has_no_reason(x) -> str:
-    """Return "", the reason against a state of a system that allows every state."""
+def _empty_reason(x) -> str:
+    """Return "", since every state of the system is allowed."""
     return ""
 
 
@@ -33,14 +33,14 @@ class Domain:
     """
 
     description: str = ""
-    why_outside: Callable[[Any], str] = _has_no_reason
-    why_singular: Callable[[Any], str] = _has_no_reason
+    why_outside: Callable[[Any], str] = _empty_reason
+    why_singular: Callable[[Any], str] = _empty_reason
     margin: Callable[[Any], jax.Array] | None = None
 
     @property
     def allows_every_start(self) -> bool:
         """True if a run may start at every finite state."""
-        return self.why_outside == _has_no_reason and self.why_singular == _has_no_reason
+        return self.why_outside == _empty_reason and self.why_singular == _empty_reason
 
     def margin_at(self, x) -> jax.Array:
         """Return the margin of a domain that has one, at a state, shape (n,)."""

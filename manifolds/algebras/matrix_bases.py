@@ -100,7 +100,7 @@ class MatrixBasis:
         )
 
     def matrix(self, x) -> tuple[jax.Array, ...]:
-        """Return ``sum_a x_a e_a`` as a tuple of parts, for x of shape (..., dim)."""
+        """Return the real and, if complex, imaginary part of ``sum_a x_a e_a``; x has shape (..., dim)."""
         components_and_zero = jnp.concatenate([x, jnp.zeros((*x.shape[:-1], 1))], axis=-1)
         parts = []
         for part in range(self.parts):
@@ -113,7 +113,7 @@ class MatrixBasis:
         return tuple(parts)
 
     def inner_products(self, parts: tuple[jax.Array, ...]) -> jax.Array:
-        """Return ``<A, e_a>`` for each a, shape (..., dim); A is given by its real and imaginary parts.
+        """Return ``<A, e_a>`` for each a, shape (..., dim); A is given by its real and, if complex, imaginary part.
 
         This is the transpose of :meth:`matrix`.
         """

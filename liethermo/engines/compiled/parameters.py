@@ -65,5 +65,5 @@ def parameter_arrays(module: eqx.Module) -> tuple[np.ndarray, ...]:
 
 
 def flat_parameters(*modules: eqx.Module) -> np.ndarray:
-    """Return the parameters of systems, methods or step controls, one after another, shape (p,)."""
+    """Return the parameter arrays of systems, methods or step controls, flattened and joined, shape (p,)."""
     return np.concatenate([np.zeros(0), *(array.ravel() for module in modules for array in parameter_arrays(module))])

@@ -267,7 +267,7 @@ class Lattice(metaclass=ListedType):
         return Bonds.from_rows(self, rows)
 
     def shells(self, count: int) -> tuple[Bonds, ...]:
-        """Return the bonds of the nearest shells of neighbours, by distance, as in an infinite crystal.
+        """Return the bonds of the nearest ``count`` shells of neighbours, which are those of an infinite crystal.
 
         In a crystal with a basis, a shell is a set of all bonds of one length.
         """
