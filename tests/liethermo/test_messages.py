@@ -119,6 +119,25 @@ def test_the_line_is_named():
         body(with_if)
 
 
+TWO = np.array([0, 1])
+
+
+@pytest.mark.parametrize(
+    ("change", "advice"),
+    [
+        (lambda m: m.at[1].apply(jnp.sin), lambda m: m.at[1].set(jnp.sin(m[1]))),
+        (lambda m: m.at[TWO].multiply(m[1:]), lambda m: m.at[TWO].set(m[TWO] * m[1:])),
+    ],
+    ids=["apply", "multiply"],
+)
+def test_a_change_of_entries_that_jax_cannot_differentiate(change, advice):
+    with pytest.raises(lt.FunctionError, match=r"Replace x\.at\[i\]\.apply\(f\) by x\.at\[i\]\.set\(f\(x\[i\]\)\)"):
+        body(lambda m: jnp.sum(change(m) ** 2))
+    solution = run(body(lambda m: jnp.sum(advice(m) ** 2)))
+    assert solution.audit().passed
+    run(body(lambda m: jnp.sum((m.at[1].multiply(2.0)) ** 2)))
+
+
 def test_numbers_in_single_precision_are_no_fault():
     """Arrays of float32 in a closure are exact numbers; so is a mean of truth values."""
     weights = jnp.array([1.0, 2.0, 3.0], dtype=jnp.float32)
