@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 
@@ -11,8 +12,9 @@ import jax.numpy as jnp
 
 from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..tracing.interpret import polynomial_degree_bound
+from ..tracing.searches import iterate_equations
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
-from ..tracing.traced import trace_callables_and_result_shapes
+from ..tracing.traced import TracedFunction, trace_callables_and_result_shapes
 from .energy import Energy, Function, Multiple, Negative, Pullback, SpanLimitedEnergy, StateTimeEnergy, Sum
 
 
@@ -85,7 +87,31 @@ def checked_energy(energy: Energy, dim: int, role: str, allow_time: bool = False
         )
     if not jnp.issubdtype(result.dtype, jnp.floating):
         raise FunctionError(f"{role} must return a real number, but it returns {result.dtype}")
+    _check_derivative_of_scatter(energy, dim, role)
     return energy
+
+
+def _check_derivative_of_scatter(energy: Energy, dim: int, role: str) -> None:
+    """Raise FunctionError if an energy changes entries of an array in a way that JAX cannot differentiate."""
+    programs = [
+        leaf.program
+        for leaf in jax.tree_util.tree_leaves(energy, is_leaf=_is_traced_function)
+        if _is_traced_function(leaf)
+    ]
+    equations = itertools.chain.from_iterable(iterate_equations(p.closed_jaxpr.jaxpr) for p in programs)
+    if not any(equation.primitive.name.startswith("scatter") for equation, _ in equations):
+        return
+    try:
+        jax.eval_shape(lambda x: energy.at_time(0.0).gradient(x), jax.ShapeDtypeStruct((dim,), jnp.float64))
+    except NotImplementedError as error:
+        raise FunctionError(
+            f"{role} must have a derivative, but JAX cannot compute it: {error}. Replace x.at[i].apply(f) by "
+            "x.at[i].set(f(x[i])), and x.at[i].multiply(a), if each index occurs once, by x.at[i].set(x[i] * a)"
+        ) from error
+
+
+def _is_traced_function(leaf) -> bool:
+    return isinstance(leaf, TracedFunction)
 
 
 def trace_energies(tree, dim: int, role: str | None = None):

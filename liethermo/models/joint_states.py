@@ -163,7 +163,7 @@ class TreeSystem(System):
         """Return states of bodies, shape (..., n), with the entropy of the bath at a temperature, if one is given."""
         if temperature is None:
             return x
-        if self.baths is None:
+        if not self.baths.number:
             raise InputError("temperature= needs a bath. Build the system by tree.system(baths=lt.HeatBaths(...))")
         y = entropies_of_temperatures(self.baths, temperature)
         return jnp.concatenate([*broadcast_batches(x, y)], axis=-1)

@@ -221,28 +221,17 @@ class System(SystemInterface):
 
     def vector_field(self, x, t=None) -> jax.Array:
         """Return ``x'`` at states x, shape (..., n), and at the time t if the energy depends on it."""
-        return evaluate_batch(self, lambda system, y: system._vector_field(y), x, t, "(n)")
+        return evaluate_batch(self, _field_at, x, t, "(n)")
 
     def entropy_production(self, x, t=None) -> jax.Array:
         """Return the rate of growth of the entropy, ``grad S . x'``, shape (...), at states x and the time t."""
-        entropy = self.entropy
-        if entropy is None:
+        if self.entropy is None:
             raise InputError("this system has no entropy")
-        return evaluate_batch(self, lambda system, y: jnp.dot(entropy.gradient(y), system._vector_field(y)), x, t, "()")
+        return evaluate_batch(self, _entropy_production_at, x, t, "()")
 
     def energy_fall(self, x, t=None) -> jax.Array:
         """Return the rate at which the dissipation lowers the energy, ``-grad H . force``, shape (...), at x and t."""
-
-        def fall_rate(system: System, y):
-            if system.dissipation is None:
-                return jnp.zeros(())
-            dH = system.energy.gradient(y)
-            dS = system.entropy_gradient(y)
-            return -system.dissipation.rate_of_change(
-                system, y, dH, dS, tuple(L.gradient(y) for L in system.preserved), dH
-            )
-
-        return evaluate_batch(self, fall_rate, x, t, "()")
+        return evaluate_batch(self, _energy_fall_at, x, t, "()")
 
     @with_library_settings
     def friction_matrix(self, x, t=None, dissipation: Dissipation | None = None) -> jax.Array:
@@ -383,6 +372,23 @@ def _attach_baths(system: System, baths: HeatBaths, bath_terms: tuple[Dissipatio
     if bath_terms:
         bound_terms = tuple(_bind_dissipation(system, term) for term in bath_terms)
         system.dissipation = sum_dissipations((*system.total_dissipation.terms, *bound_terms))
+
+
+def _field_at(system: System, x) -> jax.Array:
+    return system._vector_field(x)
+
+
+def _entropy_production_at(system: System, x) -> jax.Array:
+    assert system.entropy is not None
+    return jnp.dot(system.entropy.gradient(x), system._vector_field(x))
+
+
+def _energy_fall_at(system: System, x) -> jax.Array:
+    if system.dissipation is None:
+        return jnp.zeros(())
+    dH, dS = system.energy.gradient(x), system.entropy_gradient(x)
+    dL = tuple(L.gradient(x) for L in system.preserved)
+    return -system.dissipation.rate_of_change(system, x, dH, dS, dL, dH)
 
 
 def _drop_last_factor(space: mf.Space) -> mf.Space:

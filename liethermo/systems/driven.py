@@ -270,5 +270,16 @@ class _TimedChartEnergy(Energy):
 
 
 def make_autonomous(system: System, unit: float = CLOCK_UNIT) -> System:
-    """Return the system with clock and work if work is done from outside; otherwise the system itself."""
+    """Return the system with clock and work if work is done from outside; otherwise the system itself.
+
+    Raises
+    ------
+    InputError
+        If the torque of the system is frozen at one time: its work would be left out.
+    """
+    if system.torque_laws.name and not system.is_driven:
+        raise InputError(
+            f"a run needs the torque {system.torque_laws.name} as a function of the time, but system.at_time(...) has "
+            "frozen it. Run the system itself; for a torque that is constant give torque=lambda t: ..."
+        )
     return DrivenSystem(system, unit) if system.is_driven else system

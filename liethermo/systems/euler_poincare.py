@@ -120,14 +120,22 @@ class EulerPoincareSystem(LiePoissonSystem):
 
     def velocity(self, mu, t=None) -> jax.Array:
         """Return the velocity ``xi = dH/dmu`` of states, shape (..., dim), at the time t if the Lagrangian needs it."""
-        return evaluate_batch(self.drop_torque(), lambda system, mu: system.energy.gradient(mu), mu, t, "(n)")
+        return evaluate_batch(self.drop_torque(), _velocity_at, mu, t, "(n)")
 
     def momentum_of_velocity(self, xi, t=None):
         return self.momentum(xi, t)
 
     def momentum(self, xi, t=None) -> jax.Array:
         """Return the momentum ``mu = dl/dxi`` of velocities, shape (..., dim), at the time t if it is needed."""
-        return evaluate_batch(self.drop_torque(), lambda system, xi: system.lagrangian.gradient(xi), xi, t, "(n)")
+        return evaluate_batch(self.drop_torque(), _momentum_at, xi, t, "(n)")
+
+
+def _velocity_at(system: EulerPoincareSystem, mu) -> jax.Array:
+    return system.energy.gradient(mu)
+
+
+def _momentum_at(system: EulerPoincareSystem, xi) -> jax.Array:
+    return system.lagrangian.gradient(xi)
 
 
 class _TimedLegendre(Module):

@@ -157,11 +157,15 @@ class EvolutionSystem(MomentumContactSystem):
 
     def temperature(self, x, t=None) -> jax.Array:
         """Return the temperature ``T = H_S`` of states, shape (...), at the time t if the energy depends on it."""
-        return evaluate_batch(self, lambda system, y: system.energy.gradient(y)[-1], x, t, "()")
+        return evaluate_batch(self, _temperature_at, x, t, "()")
 
     def temperatures(self, x, t=None) -> jax.Array:
         """Return the temperature with an axis of length 1, shape (..., 1): see :meth:`temperature`."""
         return self.temperature(x, t)[..., None]
+
+
+def _temperature_at(system: EvolutionSystem, x) -> jax.Array:
+    return system.energy.gradient(x)[-1]
 
 
 class ContactSystem(MomentumContactSystem):

@@ -10,9 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._arrays import is_traced
 from manifolds._precision import with_library_settings
 
 from ..errors import InputError
+from ..tracing.programs import jit_unoptimised
 
 
 def checked_state_array(system: Any, x, batch: bool = False) -> np.ndarray | jax.Array:
@@ -72,6 +74,8 @@ def evaluate_batch(system: Any, function: Callable, x, t, result_signature: str)
 
     Parameters
     ----------
+    function : function of a system and a state
+        Defined in a module: programs are cached by it.
     result_signature : str
         The shape of one result, as in ``"(n)"``.
 
@@ -82,12 +86,25 @@ def evaluate_batch(system: Any, function: Callable, x, t, result_signature: str)
     """
     x = system.state(x, batch=True)
     if not system.is_driven:
-        return jnp.vectorize(lambda y: function(system, y), signature=f"(n)->{result_signature}")(x)
-    if t is None:
+        t = None
+    elif t is None:
         what = "energy of this system depends on" if system.energy.depends_on_time else "torque is known at a"
         raise InputError(f"the {what} time. Give the time beside the state")
+    else:
+        t = jnp.asarray(t, dtype=jnp.float64)
+    evaluate = _evaluate_batch if is_traced((system, x, t)) else _evaluate_batch_program
+    return evaluate(system, function, x, t, result_signature)
+
+
+def _evaluate_batch(system: Any, function: Callable, x, t, result_signature: str) -> jax.Array:
+    if t is None:
+        return jnp.vectorize(lambda y: function(system, y), signature=f"(n)->{result_signature}")(x)
     evaluate = jnp.vectorize(lambda y, t: function(system.at_time(t), y), signature=f"(n),()->{result_signature}")
-    return evaluate(x, jnp.asarray(t, dtype=jnp.float64))
+    return evaluate(x, t)
+
+
+_evaluate_batch_program = jit_unoptimised(_evaluate_batch)
+"""The same as one program: operations that are called one by one are compiled one by one."""
 
 
 def reshape_to_sites(system: Any, result: Any) -> Any:

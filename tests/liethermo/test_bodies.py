@@ -123,7 +123,7 @@ def test_what_has_no_angles():
     assert lt.bodies.nutation(free_body).shape == (11,)  # needs no attitude
     with pytest.raises(lt.InputError, match=r"there are no attitudes.*attitude=True"):
         lt.bodies.quaternions(free_body)
-    with pytest.raises(lt.InputError, match=r"of a solution or an ensemble, got 'body\.csv'"):
+    with pytest.raises(lt.InputError, match=r"need a solution or an ensemble, got 'body\.csv'"):
         lt.bodies.write_csv(free_body, "body.csv")  # the path comes first
     oscillator = lt.integrate(lt.models.damped_oscillator(), (0.0, 1.0, 0.0), (0.0, 1.0), 0.1)
     with pytest.raises(lt.InputError, match="momentum on so"):

@@ -119,6 +119,25 @@ def test_the_line_is_named():
         body(with_if)
 
 
+TWO = np.array([0, 1])
+
+
+@pytest.mark.parametrize(
+    ("change", "advice"),
+    [
+        (lambda m: m.at[1].apply(jnp.sin), lambda m: m.at[1].set(jnp.sin(m[1]))),
+        (lambda m: m.at[TWO].multiply(m[1:]), lambda m: m.at[TWO].set(m[TWO] * m[1:])),
+    ],
+    ids=["apply", "multiply"],
+)
+def test_a_change_of_entries_that_jax_cannot_differentiate(change, advice):
+    with pytest.raises(lt.FunctionError, match=r"Replace x\.at\[i\]\.apply\(f\) by x\.at\[i\]\.set\(f\(x\[i\]\)\)"):
+        body(lambda m: jnp.sum(change(m) ** 2))
+    solution = run(body(lambda m: jnp.sum(advice(m) ** 2)))
+    assert solution.audit().passed
+    run(body(lambda m: jnp.sum((m.at[1].multiply(2.0)) ** 2)))
+
+
 def test_numbers_in_single_precision_are_no_fault():
     """Arrays of float32 in a closure are exact numbers; so is a mean of truth values."""
     weights = jnp.array([1.0, 2.0, 3.0], dtype=jnp.float32)
@@ -212,3 +231,16 @@ def test_times_that_cannot_be_used(options, message):
 def test_a_span_may_be_any_pair_of_numbers(span):
     assert run(lt.models.rigid_body((3.0, 2.0, 1.0)), span=span).t[-1] == 1.0
     assert run(lt.models.rigid_body((3.0, 2.0, 1.0)), span=span, step=lt.Adaptive(1e-6)).t[-1] == 1.0
+
+
+def test_a_torque_frozen_at_one_time_is_not_run():
+    """Its work would be missing, so that the laws would hold for another motion."""
+    push = lt.torques.ConstantInBody([0.1, 0.0, 0.0])
+    for torque, arguments in ((push, (0.3,)), (lambda t, mu, A: A[0], (0.3, np.eye(3)))):
+        system = body(lambda m: m @ m, torque=torque, group=mf.SO(3))
+        frozen_system = system.at_time(*arguments)
+        assert np.isfinite(frozen_system.vector_field(jnp.asarray(START))).all()
+        for attempt in (run, lambda s: lt.flow(s, START, SPAN, STEP), lambda s: lt.ensemble(s, [START], SPAN, STEP)):
+            with pytest.raises(lt.InputError, match=r"frozen it\. Run the system itself"):
+                attempt(frozen_system)
+        assert run(system).audit().passed

@@ -170,9 +170,7 @@ class ComposedSystem(System):
 
     def temperatures(self, x, t=None) -> jax.Array:
         """Return the temperatures ``T_a = H_{S_a}``, shape (..., N), at x and at t if the energy depends on it."""
-        return evaluate_batch(self, lambda system, y: system.energy.gradient(y), x, t, "(n)")[
-            ..., self._state_indices.S
-        ]
+        return evaluate_batch(self, _energy_gradient, x, t, "(n)")[..., self._state_indices.S]
 
     def numbers_of_particles(self, x) -> jax.Array:
         """Return the particle numbers of all bodies, shape (..., K)."""

@@ -107,7 +107,7 @@ def test_equations_that_define_no_group_are_refused():
         (lambda A: A - jnp.eye(2), mf.ParameterError, "isolated"),
         (lambda A: (A[0, 1] - A[1, 0]) ** 2, mf.ParameterError, "derivative of f at the identity is zero"),
         (lambda A: A[0, 1] - A[1, 0] + (A[0, 0] - 1.0), mf.ClosureError, "leaves the span"),
-        (lambda A: jnp.stack([A[0, 1], A[1, 0], A[0, 0] + A[1, 1] - 2.0]), mf.ClosureError, "no group"),
+        (lambda A: jnp.stack([A[0, 1], A[1, 0], A[0, 0] + A[1, 1] - 2.0]), mf.ClosureError, "not a group"),
     ]
     for f, error, message in cases:
         with pytest.raises(error, match=message):
