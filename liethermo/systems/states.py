@@ -104,7 +104,7 @@ def _evaluate_batch(system: Any, function: Callable, x, t, result_signature: str
 
 
 _evaluate_batch_program = jit_unoptimised(_evaluate_batch)
-"""The same as one program: operations that are called one by one are compiled one by one."""
+"""Compiled form of :func:`_evaluate_batch`: one program, where a direct call compiles each operation by itself."""
 
 
 def reshape_to_sites(system: Any, result: Any) -> Any:
