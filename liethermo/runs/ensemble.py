@@ -277,6 +277,8 @@ def _checked_initial_states(family: Family, x0s, n_attitudes: int) -> tuple[np.n
     InputError
         If no trajectory can start.
     """
+    if len(family.refusal_reasons) == family.size:
+        raise InputError(f"no trajectory can be started; trajectory 0: {family.refusal_reasons[0]}")
     member = family.example
     if member is None:
         member = family.member(next(i for i in range(family.size) if i not in family.refusal_reasons))

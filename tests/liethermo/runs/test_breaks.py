@@ -342,9 +342,9 @@ def test_bad_breaks_are_refused(body, breaks):
 
 
 def test_bad_tables_are_refused():
-    with pytest.raises(lt.InputError, match="increasing"):
+    with pytest.raises(lt.InputError, match="must increase"):
         lt.PiecewiseConstant([1.0, 0.5], [1.0])
-    with pytest.raises(lt.InputError, match="one value"):
+    with pytest.raises(lt.InputError, match="one for each interval"):
         lt.torques.PiecewiseConstant([1.0, 2.0], TORQUES)
 
 

@@ -55,7 +55,7 @@ def test_outputs():
     assert np.array_equal(summary.entropy, path.entropy[:, -1])
     drift = np.abs(path.energy - path.energy[:, :1]).max(axis=1)
     drift /= np.maximum(np.abs(path.energy[:, 0]), path.energy_sensitivity)
-    gradient = np.linalg.norm(rigid_body().energy.linear_part(path.x.reshape(-1, 3)), axis=-1)
+    gradient = np.linalg.norm(rigid_body().energy.apply_matrix(path.x.reshape(-1, 3)), axis=-1)
     sensitivity = (gradient * np.linalg.norm(path.x.reshape(-1, 3), axis=-1)).reshape(5, 51).max(axis=1)
     assert np.allclose(path.energy_sensitivity, sensitivity, rtol=1e-14)
     assert np.array_equal(summary.energy_drift, drift)

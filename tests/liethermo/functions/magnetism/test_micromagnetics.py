@@ -7,7 +7,7 @@ import pytest
 
 import liethermo as lt
 from liethermo.functions.magnetism.newell import (
-    _closed_form,
+    _closed_form_tensors,
     _mean_dipole_tensors,
     demagnetising_tensors,
     mirror_octant,
@@ -68,7 +68,7 @@ def test_near_and_far_formulas_agree(edges):
     """At eight edges both are accurate; a control with two nodes is not."""
     size = np.array(edges)
     offsets = np.rint(8.0 * np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0.6, 0.5]]) / size).astype(int)
-    near = _closed_form(offsets, size)
+    near = _closed_form_tensors(offsets, size)
     np.testing.assert_allclose(_mean_dipole_tensors(offsets * size, size, 6), near, atol=1e-15)
     assert np.abs(_mean_dipole_tensors(offsets * size, size, 2) - near).max() > 1e-9
 
