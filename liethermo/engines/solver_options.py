@@ -85,7 +85,7 @@ class SolverOptions:
     stall_ratio: float = 0.8
     update_floor: float = 1e-5 * EPS
     plateau_rtol: float = 1e3 * EPS
-    rounding_rtol: float = 2.0 * EPS
+    rounding_rtol: float = 16.0 * EPS
     min_contraction: float = 1e-4
     projection_rtol: float = LEVEL_RTOL_OF_STEP
     projection_state_rtol: float = LEVEL_RTOL_OF_STATE
