@@ -193,7 +193,7 @@ def test_forces_at_one_point():
     assert (float(plane.heating(q, q, 0.1)), float(plane.heating(q, q, 0.1, 2.0))) == (1.0, 3.0)
     with pytest.raises(lt.InputError, match=r"functions of \(xi, S, t\), but 1 arguments"):
         algebra.friction_force(ones)
-    with pytest.raises(lt.InputError, match=r"functions of \(q, v, S, t\), and 2 arguments"):
+    with pytest.raises(lt.InputError, match=r"functions of \(q, v, S, t\), but 2 arguments"):
         plane.friction_force(q, q)
 
 
