@@ -39,6 +39,7 @@ from .equilibria import Equilibrium, steady_state
 from .hamiltonian import checked_density_matrices, checked_parts, hamiltonian_energy, join_baths, tensor_with_identity
 from .interface import EngineHints, InvariantVerdicts
 from .invariants import systems_at_test_times
+from .states import checked_times
 from .transport import has_generator
 
 LINDBLAD_EIGENVALUE_LIMIT = 1e-6
@@ -481,14 +482,15 @@ class QuantumSystem(System):
         t : float or array, shape (...), optional
             The time, if the Hamiltonian depends on it.
         """
-        if not self.is_driven or t is None:
-            return jnp.zeros(self.state(x, batch=True).shape[:-1])
+        states, times = self.state(x, batch=True), checked_times(self, t)
+        if times is None:
+            return jnp.zeros(states.shape[:-1])
 
         def power_at(y, time):
             return jax.jvp(lambda s: jnp.dot(self._hamiltonian_at(s), y[: self.body_dim]), (time,), (jnp.ones(()),))[1]
 
         evaluate = jnp.vectorize(power_at, signature="(n),()->()")
-        return evaluate(self.state(x, batch=True), jnp.asarray(t, dtype=jnp.float64))
+        return evaluate(states, times)
 
     def adiabatic_parameter(self, t) -> jax.Array:
         """Return ``max |<a| dH/dt |b>| / (E_a - E_b)^2`` over pairs of levels, shape (...) (dimensionless).

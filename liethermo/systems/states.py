@@ -84,16 +84,25 @@ def evaluate_batch(system: Any, function: Callable, x, t, result_signature: str)
     InputError
         If a time is needed and none is given.
     """
-    x = system.state(x, batch=True)
-    if not system.is_driven:
-        t = None
-    elif t is None:
-        what = "energy of this system depends on" if system.energy.depends_on_time else "torque is known at a"
-        raise InputError(f"the {what} time. Give the time beside the state")
-    else:
-        t = jnp.asarray(t, dtype=jnp.float64)
+    x, t = system.state(x, batch=True), checked_times(system, t)
     evaluate = _evaluate_batch if is_traced((system, x, t)) else _evaluate_batch_program
     return evaluate(system, function, x, t, result_signature)
+
+
+def checked_times(system: Any, t) -> jax.Array | None:
+    """Return the times of states as an array; None for a system that does not depend on time.
+
+    Raises
+    ------
+    InputError
+        If a time is needed and none is given.
+    """
+    if not system.is_driven:
+        return None
+    if t is None:
+        what = "energy of this system depends on" if system.energy.depends_on_time else "torque is known at a"
+        raise InputError(f"the {what} time. Give the time beside the state")
+    return jnp.asarray(t, dtype=jnp.float64)
 
 
 def _evaluate_batch(system: Any, function: Callable, x, t, result_signature: str) -> jax.Array:

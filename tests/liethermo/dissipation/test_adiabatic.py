@@ -126,6 +126,15 @@ def test_both_laws_hold_with_a_finite_bath(method):
     np.testing.assert_allclose(run.casimirs["work"][-1], work, rtol=3e-3)
 
 
+def test_the_power_of_a_drive_needs_the_time():
+    driven = qubit(baths=lt.HeatBaths(capacity=0.8, temperature=T))
+    x = np.stack([driven.state(RHO)] * 3)
+    with pytest.raises(lt.InputError, match="Give the time beside the state"):
+        driven.power(x)
+    undriven = lt.QuantumSystem(np.diag([0.0, 1.0]))
+    assert np.array_equal(undriven.power(x[:, : undriven.dim]), np.zeros(3))
+
+
 def test_the_friction_is_symmetric_and_takes_no_energy():
     assert qubit().check(times=1.0).passed
 
