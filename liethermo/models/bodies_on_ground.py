@@ -15,6 +15,7 @@ from manifolds._pytree_module import replace_fields
 
 from ..errors import InputError
 from ..systems import HeatBaths
+from ..systems.body_states import append_entropies, broadcast_batches
 from ..systems.interface import TORQUE_FREE_LAWS, TorqueLaws
 from ..systems.torque import TorqueSystem
 from .articulated_bodies import ArticulatedBodies, JointSprings, WeightPotential
@@ -22,7 +23,6 @@ from .joint_states import (
     JointMotors,
     JointRange,
     TreeSystem,
-    broadcast_batches,
     kinetic_and_spring_terms,
     make_joint_damping,
     sum_of_terms,
@@ -129,5 +129,5 @@ class BodiesOnGround(TreeSystem, TorqueSystem):
         q = self._joint_vector_from_names(joints, "joints", degrees)
         q, rates = broadcast_batches(q, self._joint_vector_from_names(joint_rates, "joint_rates", degrees))
         momenta = jnp.einsum("...ij,...j->...i", self.mass_matrix(q), rates)
-        x = self._append_entropies(jnp.concatenate([q, momenta], axis=-1), temperature)
+        x = append_entropies(jnp.concatenate([q, momenta], axis=-1), self.baths, temperature)
         return super().state(x, x.ndim > 1)

@@ -18,7 +18,6 @@ from manifolds._pytree_module import Module
 from ..errors import InputError
 from ..functions.energy import Energy, Pullback, Sum
 from ..systems.base import System
-from ..systems.body_states import entropies_of_temperatures
 from ..systems.interface import EngineHints, MotionQuantities
 from ..tracing.programs import jit_unoptimised
 from .articulated_bodies import ArticulatedBodies, JointDamping, JointSprings, KineticEnergy, Motion
@@ -158,25 +157,6 @@ class TreeSystem(System):
             raise InputError(f"the entries of {argument_name} have different lengths") from None
         vector = jnp.concatenate([jnp.broadcast_to(c, (*shape, c.shape[-1])) for c in columns], axis=-1)
         return jnp.where(np.array(self.mechanism.slides), vector, jnp.deg2rad(vector)) if degrees else vector
-
-    def _append_entropies(self, x, temperature) -> jax.Array:
-        """Return states of bodies, shape (..., n), with the entropy of the bath at a temperature, if one is given."""
-        if temperature is None:
-            return x
-        if not self.baths.number:
-            raise InputError("temperature= needs a bath. Build the system by tree.system(baths=lt.HeatBaths(...))")
-        y = entropies_of_temperatures(self.baths, temperature)
-        return jnp.concatenate([*broadcast_batches(x, y)], axis=-1)
-
-
-def broadcast_batches(*arrays: jax.Array) -> tuple[jax.Array, ...]:
-    """Broadcast arrays of shape (n_i,) or (B, n_i) to a common batch shape, () or (B,)."""
-    batch_shapes = [array.shape[:-1] for array in arrays]
-    try:
-        shape = jnp.broadcast_shapes(*batch_shapes)
-    except ValueError:
-        raise InputError(f"the arguments of a state have batches of different lengths: {batch_shapes}") from None
-    return tuple(jnp.broadcast_to(array, (*shape, array.shape[-1])) for array in arrays)
 
 
 def checked_vectors(value, name: str) -> jax.Array:

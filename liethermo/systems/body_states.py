@@ -69,11 +69,35 @@ def checked_velocity(angular_velocity, rotor_rates, dim: int, batch: bool, degre
             f"rotor_rates must have shape ({'..., ' if batch else ''}{n_rotors},), one for each rotor, got "
             f"{rates.shape}"
         )
-    shape = jnp.broadcast_shapes(omega.shape[:-1], rates.shape[:-1])
-    parts = (jnp.broadcast_to(part, (*shape, part.shape[-1])) for part in (omega, rates))
-    velocity = jnp.concatenate([*parts], axis=-1)
+    velocity = jnp.concatenate(broadcast_batches(omega, rates), axis=-1)
     require_condition(velocity, lambda v: abs(v) < jnp.inf, "velocities must be finite, got {value}")
     return jnp.deg2rad(velocity) if degrees else velocity
+
+
+def broadcast_batches(*arrays: jax.Array) -> tuple[jax.Array, ...]:
+    """Broadcast arrays of shape (..., n_i) to a common batch shape."""
+    batch_shapes = [array.shape[:-1] for array in arrays]
+    try:
+        shape = jnp.broadcast_shapes(*batch_shapes)
+    except ValueError:
+        raise InputError(f"the arguments of a state have batches of different lengths: {batch_shapes}") from None
+    return tuple(jnp.broadcast_to(array, (*shape, array.shape[-1])) for array in arrays)
+
+
+def append_entropies(x, baths: HeatBaths, temperature) -> jax.Array:
+    """Return states of a body, shape (..., n), followed by the entropies of its baths at a temperature, if one is
+    given.
+
+    Raises
+    ------
+    InputError
+        If there are no baths, or one has not such a temperature.
+    """
+    if temperature is None:
+        return x
+    if not baths.number:
+        raise InputError("temperature= needs a system with baths. Build the system with baths=lt.HeatBaths(...)")
+    return jnp.concatenate(broadcast_batches(x, entropies_of_temperatures(baths, temperature)), axis=-1)
 
 
 def momentum_of_velocity(energy: Energy, velocity) -> jax.Array:

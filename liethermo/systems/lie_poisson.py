@@ -20,7 +20,7 @@ from ..functions.energy import Energy, make_energy
 from ..tracing.caching import memoize
 from ..tracing.interpret import evaluate_at_points
 from .baths import BathEntropy, HeatBaths
-from .body_states import checked_velocity, entropies_of_temperatures, is_given_by_velocity, momentum_of_velocity
+from .body_states import append_entropies, checked_velocity, is_given_by_velocity, momentum_of_velocity
 from .interface import TORQUE_FREE_LAWS, MotionQuantities, OrbitLevels, TorqueLaws
 from .torque import (
     MAX_ARGUMENTS,
@@ -197,16 +197,9 @@ class LiePoissonSystem(TorqueSystem):
         details = {"rotor_rates": rotor_rates, "temperature": temperature, "degrees": degrees or None}
         if not is_given_by_velocity(self, x, angular_velocity, "momentum", **details):
             return super().state(x, batch)
-        if temperature is not None and not self.baths.number:
-            raise InputError("temperature= needs a system with baths. Build the system with baths=lt.HeatBaths(...)")
         velocity = checked_velocity(angular_velocity, rotor_rates, self.algebra.dim, batch, degrees)
         momentum = self.momentum_of_velocity(velocity, t)
-        if temperature is not None:
-            y = entropies_of_temperatures(self.baths, temperature)
-            shape = jnp.broadcast_shapes(momentum.shape[:-1], y.shape[:-1])
-            parts = (jnp.broadcast_to(part, (*shape, part.shape[-1])) for part in (momentum, y))
-            momentum = jnp.concatenate([*parts], axis=-1)
-        return super().state(momentum, batch)
+        return super().state(append_entropies(momentum, self.baths, temperature), batch)
 
     def momentum_of_velocity(self, xi, t=None) -> jax.Array:
         """Return the momentum mu with ``dH/dmu = xi``, shape (..., algebra.dim), at the time t if H depends on it."""
