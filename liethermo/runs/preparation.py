@@ -192,9 +192,9 @@ def limit_to_span(system: System, schedule: StepSchedule) -> System:
     At the breaks within the span functions of time may jump. Equal arguments return the same object, so that cached
     results are shared.
     """
-    span = *schedule.function_span, *schedule.breaks
     if system.clock is None:
         return system
+    span = *schedule.function_span, *schedule.breaks
     if is_traced(system):
         return set_time_span(system, *span)
     # the value holds the system, so that its id stays its own
@@ -204,8 +204,9 @@ def limit_to_span(system: System, schedule: StepSchedule) -> System:
 
 def limit_family_to_span(family: Family, system: System, schedule: StepSchedule) -> Family:
     """Return the family with each member limited to the span of a schedule; ``system`` is one of the members."""
-    span = *schedule.function_span, *schedule.breaks
-    return family.map_members_with_shared_numbers(set_time_span, *span) if system.clock is not None else family
+    if system.clock is None:
+        return family
+    return family.map_members_with_shared_numbers(set_time_span, *schedule.function_span, *schedule.breaks)
 
 
 @memoize

@@ -91,11 +91,8 @@ class StepSchedule:
     Attributes
     ----------
     start, end, h : float
-    breaks : tuple of float
-        The breaks inside the span.
-    function_span : (float, float)
-        First and last time at which functions of time are evaluated: the span, but from after a break at its start,
-        and from before a break at its end, by a rounding error.
+    breaks, all_breaks : tuple of float
+        The breaks inside the span, and all.
     segments : list of ScheduleSegment
         One for each stop: each time to save, and each break.
     n_steps : int
@@ -123,14 +120,9 @@ class StepSchedule:
         ):
             raise InputError(f"save_every must be a positive integer, got {save_every!r}")
         saved_stops = {self.end} if save_at is None else {float(t) for t in save_at if t > self.start}
-        rounding = BREAK_RTOL * max(abs(self.start), abs(self.end) if math.isfinite(self.end) else 0.0)
-        inner_start, inner_end = self.start + rounding, self.end - rounding
-        self.function_span = (
-            inner_start if any(abs(t - self.start) <= rounding for t in breaks) else self.start,
-            inner_end if any(abs(t - self.end) <= rounding for t in breaks) else self.end,
-        )
         self.all_breaks = tuple(breaks)
-        self.breaks = tuple(t for t in breaks if inner_start < t < inner_end)
+        rounding = self._break_rounding
+        self.breaks = tuple(t for t in breaks if self.start + rounding < t < self.end - rounding)
         stops = sorted({*saved_stops, *self.breaks})
         self.save_every = save_every
         self.segments = [
@@ -145,8 +137,24 @@ class StepSchedule:
         schedule = cls.__new__(cls)
         schedule.start = schedule.end = t
         schedule.h, schedule.save_every, schedule.segments, schedule.n_steps = 0.0, None, [], 0
-        schedule.breaks, schedule.all_breaks, schedule.function_span = (), (), (t, t)
+        schedule.breaks, schedule.all_breaks = (), ()
         return schedule
+
+    @property
+    def _break_rounding(self) -> float:
+        """Distance up to which a break counts as being at an end of the span."""
+        return BREAK_RTOL * max(abs(self.start), abs(self.end) if math.isfinite(self.end) else 0.0)
+
+    @property
+    def function_span(self) -> tuple[float, float]:
+        """First and last time at which functions of time are evaluated.
+
+        It is the span, but by a rounding error from after a break at its start, and from before a break at its end.
+        """
+        rounding = self._break_rounding
+        starts_at_break = any(abs(t - self.start) <= rounding for t in self.all_breaks)
+        ends_at_break = any(abs(t - self.end) <= rounding for t in self.all_breaks)
+        return self.start + rounding * starts_at_break, self.end - rounding * ends_at_break
 
     def with_more_breaks(self, breaks: Sequence[float]) -> StepSchedule:
         """Return the schedule with more breaks, inside the span."""

@@ -109,7 +109,7 @@ class VariedParameters:
             leaf = parameter.to_leaf(array)
             for slot in slots:
                 slot[...] = leaf
-        if not all(np.all(test(slot)) for test, slot in self._conditions):
+        if not all(test(slot).all() for test, slot in self._conditions):
             return None
         if self._test is not None:
             self._codes = self._test().min(axis=0).tolist()
