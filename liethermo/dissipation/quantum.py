@@ -345,18 +345,17 @@ class ThermalJumps(Dissipation):
             for i, coupling_omega in enumerate(omega_by_coupling)
             if jump_counts[i]
         ]
-        return weights * jnp.concatenate(rates)
+        return jnp.concatenate(rates) * weights
 
     def _rates_at(self, i: int, omega, T, time) -> jax.Array:
         """Return the rates of the coupling i at frequencies, shape (k,), and a temperature; ``time`` may be None.
 
         The rate function is traced once for all of them.
         """
-        rate, arguments = self.rates[i], (T,)
-        if i in self.timed_rates:
-            if time is None:
-                raise InputError(f"the rate of V[{i}] depends on time. Use system.at_time(t)")
-            arguments = (T, time)
+        rate = self.rates[i]
+        if i in self.timed_rates and time is None:
+            raise InputError(f"the rate of V[{i}] depends on time. Use system.at_time(t)")
+        arguments = (T, time) if i in self.timed_rates else (T,)
         if not callable(rate):
             return jnp.broadcast_to(rate, omega.shape)
         return jax.vmap(lambda w: jnp.asarray(rate(w, *arguments)))(omega)

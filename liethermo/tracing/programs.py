@@ -229,11 +229,11 @@ MIN_STORED_COMPILE_SECONDS = 0.1
 def _compile_or_load(function: Callable, arguments: tuple, options: dict | None) -> Callable:
     """Return the compiled program of a function of arrays, loaded from the cache on disk or compiled by XLA.
 
-    On the CPU it runs with one BLAS thread where it factorises small matrices. The cache is found by the text of the program, so it never returns the program of another function. The text has
-    all arguments, also those that the program does not use: without them, programs that use different ones of their
-    arguments, or have unused arguments of different shapes, would have the same text. Programs that call Python, or
-    that run on accelerators or on several devices, are not cached, nor any if JAX's own cache is on: a program that
-    comes from there cannot be written again.
+    On the CPU it runs with one BLAS thread where it factorises small matrices. The cache is found by the text of the
+    program, so it never returns the program of another function. The text has all arguments, also those that the
+    program does not use: without them, programs that use different ones of their arguments, or have unused arguments of
+    different shapes, would have the same text. Programs that call Python, or that run on accelerators or on several
+    devices, are not cached, nor any if JAX's own cache is on: a program that comes from there cannot be written again.
     """
     devices = jax.devices()
     is_cpu = devices[0].platform == "cpu"

@@ -64,7 +64,8 @@ def test_a_program_runs_with_one_thread(rows, expected):
         return jnp.linalg.eigvalsh(matrix)[-1], count
 
     largest, count = largest_eigenvalue_and_thread_count(jnp.diag(jnp.arange(1.0, rows + 1)))
-    assert float(largest) == pytest.approx(rows) and int(count) == expected
+    assert float(largest) == pytest.approx(rows)
+    assert int(count) == expected
     assert thread_counts() == {3}
 
 
