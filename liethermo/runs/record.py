@@ -28,10 +28,10 @@ from .events import EventSet, collect_events
 from .evidence import (
     MAX_LOCAL_ERROR_STEPS,
     MAX_SENSITIVITY_STATES,
-    GroupEvidence,
+    GroupEvidenceSource,
     LaneReplay,
     evenly_spaced_indices,
-    largest_and_evenly_spaced,
+    indices_of_largest_and_evenly_spaced,
 )
 from .noise import NoisePaths
 from .preparation import invariants_and_laws
@@ -363,16 +363,18 @@ class GroupRecord:
             if text := ensemble_failure_message(x[i], group.x0[j], velocity, t - group.schedule.start, t, group.h):
                 self.record.failure_reasons[int(self.numbers[j])] = text
 
-    def evidence_source(self) -> GroupEvidence:
+    def evidence_source(self) -> GroupEvidenceSource:
         """Return the function that computes the evidence for an audit, of a sample of the trajectories.
 
         Half of them are those that took most iterations, half are evenly spaced.
         """
         record, group = self.record, self.group
         n_steps = record.steps[self.numbers]
-        sample = largest_and_evenly_spaced(record.iterations[self.numbers] / np.fmax(n_steps, 1), MAX_LOCAL_ERROR_STEPS)
+        sample = indices_of_largest_and_evenly_spaced(
+            record.iterations[self.numbers] / np.fmax(n_steps, 1), MAX_LOCAL_ERROR_STEPS
+        )
         n_equal_steps = 1 if np.isnan(group.h) else group.schedule.segments[0].n_full_steps
-        return GroupEvidence(
+        return GroupEvidenceSource(
             group.member,
             LaneReplay(self.engine, group.family.select(sample), group.method),
             np.ascontiguousarray(group.x0[sample]),

@@ -29,7 +29,7 @@ from ..systems.clock import system_of_step
 from ..tracing.interpret import evaluate_at_points
 from .adaptive import Adaptive, make_step_control
 from .adaptive_run import MAX_STORED_VALUES, AcceptedSteps, AdaptiveRun
-from .driver import drive_fixed
+from .driver import take_scheduled_steps
 from .events import EventSet, collect_events
 from .noise import NoisePaths
 from .problem import Problem
@@ -114,7 +114,7 @@ class Run:
             calls = self.schedule.engine_calls(
                 max_saves=self.engine.max_saves_per_call, save_all=self.all_states is not None
             )
-            drive_fixed(trajectory, calls, record_call)
+            take_scheduled_steps(trajectory, calls, record_call)
         except INTERRUPTING_ERRORS as error:
             interruption = interruption_reason(error)
         if trajectory is None:

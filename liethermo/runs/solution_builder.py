@@ -21,7 +21,7 @@ from ..results.status import Laws
 from ..systems import System
 from ..tracing.interpret import evaluate_at_points
 from .adaptive import Adaptive
-from .evidence import EngineReplay, RunEvidence, series_of_functions
+from .evidence import EngineReplay, RunEvidenceSource, values_by_function_name
 
 
 class RecordedFunctions(NamedTuple):
@@ -81,9 +81,9 @@ def build_solution(
     solution = Solution(
         x=x,
         entropy=None if system.entropy is None else entropy,
-        casimirs=defer(functools.partial(series_of_functions, functions.of_series, x)),
+        casimirs=defer(functools.partial(values_by_function_name, functions.of_series, x)),
         laws=laws,
-        evidence_source=RunEvidence(
+        evidence_source=RunEvidenceSource(
             system, method, functions.invariants, x, np.asarray(fields["t"]), step_sizes, EngineReplay(engine)
         ),
         velocity_sources={
