@@ -28,13 +28,13 @@ from .member_groups import common_inertia, group_members_by_invariants, members_
 from .noise import Fluctuations, NoisePaths, check_noise
 from .preparation import (
     check_choice,
-    check_steps,
     checked_or_default_method,
-    limit_family_to_span,
-    limit_to_span,
+    limit_time_functions_of_family,
+    limit_time_functions_to_span,
+    refuse_incompatible_options,
     refuse_tracers,
     why_not_startable,
-    wrap_family,
+    wrap_family_like_member,
 )
 from .problem import Problem
 from .progress import Progress
@@ -135,7 +135,7 @@ def ensemble(
         raise InputError(f'save_at needs outputs="trajectory", got {outputs!r}')
     if (isinstance(step, Adaptive) or until is not None) and outputs == "trajectory" and save_at is None:
         raise InputError('outputs="trajectory" with adaptive steps or events needs save_at, common times to save')
-    check_steps(method, step, noise, until)
+    refuse_incompatible_options(method, step, noise, until)
     family = Family.from_arguments(system, parameters)
     save_every_step = save_every if outputs == "trajectory" and save_at is None else None
     declared = DeclaredTimes.from_tree(family.with_unknown_parameters())
@@ -212,9 +212,9 @@ class _EnsembleOptions(NamedTuple):
         step, schedule, noise = self.step, self.schedule, self.noise
         tolerance = step.tolerance if isinstance(step, Adaptive) else None
         problem = Problem.from_user(family.member(0), self.method, noise, tolerance, initial_states)
-        method, family = problem.method, wrap_family(family, problem.system)
+        method, family = problem.method, wrap_family_like_member(family, problem.system)
         initial_states = np.asarray(problem.system.initial_state(initial_states, schedule.start, attitude, batch=True))
-        family_in_span = limit_family_to_span(family, problem.system, schedule)
+        family_in_span = limit_time_functions_of_family(family, problem.system, schedule)
         member = problem.system_in_span(schedule)
         reasons = {
             int(trajectory_numbers[i]): text
@@ -232,10 +232,10 @@ class _EnsembleOptions(NamedTuple):
             family_in_span = family_in_span.select(startable)
         if problem.is_driven:
             members = family.members_with_extreme_parameters()[: len(initial_states)]
-            systems = [limit_to_span(family.member(i), schedule) for i in members]
+            systems = [limit_time_functions_to_span(family.member(i), schedule) for i in members]
             schedule = schedule_around_features(schedule, systems, initial_states[members], step)
             if schedule is not self.schedule:
-                family_in_span = limit_family_to_span(family, problem.system, schedule)
+                family_in_span = limit_time_functions_of_family(family, problem.system, schedule)
                 member = problem.system_in_span(schedule)
         events = None if self.until is None else EventSet(self.until, member, schedule.start, initial_states[0])
         control = noise_paths = None

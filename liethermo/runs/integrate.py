@@ -156,7 +156,7 @@ def integrate(
 
 @with_library_settings
 def solution_without_steps(system: System, x0, t: float, method: OneStepMethod) -> Solution:
-    """Return the solution over a span of length zero: the initial state at time t.
+    """Return a solution that holds only the initial state, at time t.
 
     Raises
     ------

@@ -29,7 +29,13 @@ from .ensemble import ensemble
 from .events import Until
 from .named_parameters import replace_parameters
 from .noise import Fluctuations, check_noise
-from .preparation import check_choice, check_steps, checked_or_default_method, has_undecided_invariants, refuse_tracers
+from .preparation import (
+    check_choice,
+    checked_or_default_method,
+    has_undecided_invariants,
+    refuse_incompatible_options,
+    refuse_tracers,
+)
 from .problem import Problem
 from .progress import Progress
 from .run import Run
@@ -105,10 +111,10 @@ class Propagator(metaclass=ListedType):
     ):
         if noise is not None:
             check_noise(noise)
-        method = checked_or_default_method(method, noise, runs_alone=True)
+        method = checked_or_default_method(method, noise, is_single_trajectory=True)
         require_system(system, "the first argument must be a system such as lt.LiePoissonSystem")
         check_choice("engine", engine, ENGINES)
-        check_steps(method, step, noise)
+        refuse_incompatible_options(method, step, noise)
         self.system, self.method, self.step, self.engine, self.noise = system, method, step, engine, noise
         self._variants: LRUCache[Propagator] = LRUCache(MAX_CACHED_PARAMETER_SETS)
         self._decided_problem: Problem | None = None
@@ -175,7 +181,7 @@ class Propagator(metaclass=ListedType):
         check_choice("on_failure", on_failure, ("raise", "return"))
         step, adaptive = self.step, isinstance(self.step, Adaptive)
         problem = self._problem(x0)
-        check_steps(self.method, step, self.noise, until, dense, save_at)
+        refuse_incompatible_options(self.method, step, self.noise, until, dense, save_at)
         declared = self._declared_times if problem.is_driven else TIMES_OF_SMOOTH_FUNCTIONS
         allow_infinite_end = adaptive and until is not None
         schedule = self._schedule(t_span, save_every, save_at, allow_infinite_end, breaks, declared)

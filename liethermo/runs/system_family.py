@@ -22,7 +22,7 @@ from ..systems.kind_checks import require_system
 from ..tracing.caching import fingerprint
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.traced import TracedFunction, trace_function
-from .named_parameters import arrays_with_members, find_parameter, refused_members
+from .named_parameters import reasons_of_refused_members, require_parameter, stack_member_arrays
 
 MAX_CHECKED_MEMBERS = 8
 """Largest number of members that are built and checked one by one at a time."""
@@ -99,14 +99,14 @@ class Family:
                 "For parameters of another form, give a function that builds the system"
             )
         for name, values in parameters.items():
-            has_moments = name.endswith("inertia") and find_parameter(system, name).value.shape == (3,)
+            has_moments = name.endswith("inertia") and require_parameter(system, name).value.shape == (3,)
             if has_moments and are_inertia_tensors(np.asarray(values, dtype=np.float64)):
                 raise InputError(
                     f"the values of {name} are the tensor of inertia of one body, but three sets of principal moments "
                     "are expected. Give the moments of each trajectory as a row, or a system with a tensor"
                 )
-        arrays = arrays_with_members(system, parameters)
-        reasons = refused_members(system, arrays)
+        arrays = stack_member_arrays(system, parameters)
+        reasons = reasons_of_refused_members(system, arrays)
         return cls(
             ProgramStructure.from_module(system), arrays, None if parameters else system, refusal_reasons=reasons
         )

@@ -25,7 +25,7 @@ from ..systems.invariants import (
     random_states,
 )
 from ..tracing.trace_errors import TRACE_ERRORS
-from .named_parameters import conditions_by_leaf, find_parameter
+from .named_parameters import parameter_conditions_by_leaf, require_parameter
 from .preparation import prepare_system_and_method
 from .problem import Problem
 
@@ -72,14 +72,14 @@ class VariedParameters:
 
     def __init__(self, system: System, method: Any, names: Sequence[str]):
         self._method, self._structure = method, ProgramStructure.from_module(system)
-        self._leaves, parameters = parameter_arrays(system), [find_parameter(system, name) for name in names]
+        self._leaves, parameters = parameter_arrays(system), [require_parameter(system, name) for name in names]
         self._varied_leaves = [i for parameter in parameters for i in parameter.leaves]
         ends = np.cumsum([leaf.size for leaf in self._leaves])
         self.indices = np.concatenate([np.arange(ends[i] - self._leaves[i].size, ends[i]) for i in self._varied_leaves])
         self.entries = np.concatenate([self._leaves[i].ravel() for i in self._varied_leaves])
         slots = iter(self._split(self.entries))
         self._slots = [(parameter, [next(slots) for _ in parameter.leaves]) for parameter in parameters]
-        conditions = conditions_by_leaf(system)
+        conditions = parameter_conditions_by_leaf(system)
         self._conditions = [
             (conditions[i].test, slot)
             for parameter, slots_of_leaves in self._slots
@@ -106,7 +106,7 @@ class VariedParameters:
             array = np.asarray(value, dtype=np.float64)
             if array.shape != parameter.value.shape:
                 return None
-            leaf = parameter.to_leaf(array)
+            leaf = parameter.to_stored_array(array)
             for slot in slots:
                 slot[...] = leaf
         if not all(test(slot).all() for test, slot in self._conditions):
