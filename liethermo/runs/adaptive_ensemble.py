@@ -98,7 +98,7 @@ class _BatchRecorder:
             adaptive_runs, control, self.group.method, stop_times, self._system_of_trajectory, rules
         )
         self.initial = {name: adaptive_runs.read(name).copy() for name in RECORDED_INITIAL_FIELDS}
-        self.record.record_initial(members, self.initial["x"], self.initial["energy"], self.initial["entropy"])
+        self.record.store_initial_states(members, self.initial["x"], self.initial["energy"], self.initial["entropy"])
         self.is_running = np.ones(len(members), dtype=bool)
         self._is_first_attempt = True
 
@@ -129,7 +129,7 @@ class _BatchRecorder:
             is_pending &= ~is_accepted
             if not (is_pending & (runs.read("status") == StatusCode.COMPLETED)).any():
                 break
-        self.record.store_first_steps(self.members, sizes)
+        self.record.store_first_step_sizes(self.members, sizes)
 
     def handle_pauses(self) -> None:
         handler, runs = self.pause_handler, self.runs
@@ -141,7 +141,7 @@ class _BatchRecorder:
         indices = indices[np.isin(runs.read("t", indices), self.group.schedule.saved_stop_times)]
         if indices.size:
             columns = [runs.read("x", indices), *(runs.read(n, indices)[:, None] for n in ("energy", "entropy"))]
-            self.record.store_states_at(self.members[indices], runs.read("t", indices), np.hstack(columns))
+            self.record.store_states_at_times(self.members[indices], runs.read("t", indices), np.hstack(columns))
 
     def record_ended_trajectories(self) -> None:
         status = self.runs.read("status")
@@ -169,4 +169,4 @@ class _BatchRecorder:
         initial = {name: values[indices] for name, values in self.initial.items()}
         final = {name: runs.read(name, indices) for name in REPORTED_FIELDS}
         end_time, n_rejected = runs.read("t", indices), runs.read("n_rejected", indices)
-        self.record.finish_members(members, initial, final, status_codes, end_time, n_rejected)
+        self.record.record_outcome(members, initial, final, status_codes, end_time, n_rejected)

@@ -19,7 +19,7 @@ from ..engines.step_control import StepControl
 from ..tracing.scalarize import UnsupportedPrimitive
 from .driver import advance_until_all_end
 from .events import EventSet
-from .termination import INTERRUPTING_ERRORS, interruption_reason
+from .termination import INTERRUPTING_ERRORS, interruption_reason_or_reraise
 
 ATTEMPTS_PER_CALL = 64
 """Number of attempted steps between two checks of an adaptive run."""
@@ -127,7 +127,7 @@ class AdaptiveRun:
             advance_until_all_end(self.pause_handler, self)
             self._record_failure()
         except INTERRUPTING_ERRORS as error:
-            self.interruption = interruption_reason(error)
+            self.interruption = interruption_reason_or_reraise(error)
 
     def _read_scalar(self, field_name: str) -> float:
         return float(self.runs.read(field_name)[0])

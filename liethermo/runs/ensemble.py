@@ -41,7 +41,7 @@ from .progress import Progress
 from .record import EnsembleRecord, GroupRecord, TrajectoryGroup
 from .schedule import StepSchedule, make_schedule
 from .solution_builder import run_provenance
-from .system_family import Family, broadcast_size, error_message_of
+from .system_family import Family, broadcast_size, error_message_or_empty
 from .time_features import schedule_around_features
 
 __all__ = ["MAX_THREADS", "Ensemble", "ensemble"]
@@ -138,8 +138,8 @@ def ensemble(
     refuse_incompatible_options(method, step, noise, until)
     family = Family.from_arguments(system, parameters)
     save_every_step = save_every if outputs == "trajectory" and save_at is None else None
-    declared = DeclaredTimes.from_tree(family.with_unknown_parameters())
-    schedule = make_schedule(t_span, step, save_every_step, save_at, breaks=breaks, declared=declared)
+    declared = DeclaredTimes.from_tree(family.member_with_unknown_parameters())
+    schedule = make_schedule(t_span, step, save_every_step, save_at, breaks=breaks, declared_times=declared)
     attitude = attitude_array(attitude, None)
     states, reasons = _checked_initial_states(family, x0s, len(attitude) if np.ndim(attitude) == 3 else 1)
     check_noise(noise, len(states))
@@ -308,7 +308,7 @@ def _checked_initial_states(family: Family, x0s, n_attitudes: int) -> tuple[np.n
         raise InputError(x0_reasons[0])
     reasons = dict(family.refusal_reasons) | x0_reasons
     if family.size > 1 and family.example is None:
-        reasons = family.rejection_reasons(lambda i: family.axiom_violation_text(i, states[i]), reasons)
+        reasons = family.find_rejection_reasons(lambda i: family.axiom_violation_text(i, states[i]), reasons)
     if len(reasons) == n_trajectories:
         raise InputError(f"no trajectory can be started; trajectory 0: {reasons[0]}")
     return states, reasons
@@ -357,7 +357,7 @@ def _convert_or_replace_initial_states(example_system: System, x0s) -> tuple[np.
         if rows.ndim < 2 or rows.dtype.kind not in "fiubc" or not len(rows):
             raise
     reasons = _find_invalid_rows_by_bisection(
-        lambda batch: error_message_of(lambda: example_system.state_array(rows[batch], batch=True)), len(rows)
+        lambda batch: error_message_or_empty(lambda: example_system.state_array(rows[batch], batch=True)), len(rows)
     )
     valid_rows = [i for i in range(len(rows)) if i not in reasons]
     if not valid_rows:

@@ -185,18 +185,18 @@ class FixedEnsembleRun(EnsembleRun):
         def record_call(call: EngineCall, first_step: int, states: np.ndarray) -> bool:
             nonlocal first_save
             if call.keep:
-                record.store_states(members, first_save, states)
+                record.store_consecutive_saves(members, first_save, states)
                 first_save += call.n_saves
             self.progress_counter.add(n_members * call.n_saves * call.steps_per_save / group.schedule.n_steps)
             return not is_stopped()
 
         with self._record_lock:
             initial = batch.read(RECORDED_INITIAL_FIELDS)
-            record.record_initial(members, initial["x"], initial["energy"], initial["entropy"])
+            record.store_initial_states(members, initial["x"], initial["energy"], initial["entropy"])
         noise = None if group.noise is None else functools.partial(group.noise.step_increments, members)
         try:
             take_scheduled_steps(batch, calls, record_call, noise)
         except KeyboardInterrupt:
             self.is_interrupted = True
         with self._record_lock:
-            record.finish_fixed_step_members(members, initial, batch.read(REPORTED_FIELDS))
+            record.record_outcome_of_fixed_steps(members, initial, batch.read(REPORTED_FIELDS))

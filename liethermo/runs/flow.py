@@ -212,7 +212,7 @@ def flow(
         raise InputError("flow takes save_at or save_every, got both. Remove one of them")
     save_every = 1 if save_at is not None else save_every
     x, declared_times = system.state(x0), DeclaredTimes.from_tree(system)
-    schedule = make_schedule(t_span, step, save_every, breaks=breaks, declared=declared_times)
+    schedule = make_schedule(t_span, step, save_every, breaks=breaks, declared_times=declared_times)
     times = None if save_at is None else checked_save_times(save_at, schedule)
     n, user_system = system.dim, system
     system, method = prepare_for_method(system, method, None, attitude is not None)

@@ -165,5 +165,5 @@ def solution_without_steps(system: System, x0, t: float, method: OneStepMethod) 
     """
     problem = Problem.from_user(system, method, x0=x0)
     run = Run(problem, problem.initial_state(x0, t), StepSchedule.zero_length(t), None, "auto", dense=True)
-    run.take_no_step()
+    run.complete_without_steps()
     return run.solution_so_far()

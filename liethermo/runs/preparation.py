@@ -198,7 +198,7 @@ def limit_time_functions_to_span(system: System, schedule: StepSchedule) -> Syst
     """
     if system.clock is None:
         return system
-    span = *schedule.function_span, *schedule.breaks
+    span = *schedule.span_of_time_functions, *schedule.breaks
     if is_traced(system):
         return set_time_span(system, *span)
     # the value holds the system, so that its id stays its own
@@ -210,7 +210,7 @@ def limit_time_functions_of_family(family: Family, example_member: System, sched
     """Return the family with the functions of time of each member evaluated only within the span of a schedule."""
     if example_member.clock is None:
         return family
-    return family.map_members_with_shared_numbers(set_time_span, *schedule.function_span, *schedule.breaks)
+    return family.map_members_with_shared_numbers(set_time_span, *schedule.span_of_time_functions, *schedule.breaks)
 
 
 @memoize
