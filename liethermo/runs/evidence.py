@@ -27,7 +27,7 @@ from ..results.step_sampling import (
     MAX_SAMPLED_VALUES,
     REPLAY_COST_RATIO,
     StepSample,
-    hermite_defect,
+    hermite_defects,
     sample_steps_of_run,
     vector_field,
 )
@@ -260,7 +260,7 @@ class StepChecker:
         spaced."""
         distance = np.abs(sample.x_end - sample.x).max(axis=1)
         length = np.fmax(np.fmax(distance, self.min_motion[sample.trajectory]), SMALLEST_NORMAL)
-        defect = hermite_defect(self._evaluate_field, sample) / length
+        defect = hermite_defects(self._evaluate_field, sample) / length
         indices = indices_of_largest_and_evenly_spaced(defect, self.n_substeps)
         return indices, defect[indices]
 

@@ -229,9 +229,9 @@ class Fluctuations(metaclass=ListedType):
     def increments_of_equal_steps(
         self, n_increments: int, trajectory_numbers: np.ndarray, first_step: int, n_steps: int, h: float
     ) -> np.ndarray:
-        """Return Wiener increments of ``n_steps`` steps of size h of a run that begins at time 0.
+        """Return Wiener increments, shape (trajectories, n_steps, n_increments), of equal steps of a run from time 0.
 
-        The first of these steps has the index ``first_step``. The shape is (trajectories, n_steps, n_increments).
+        The ``n_steps`` steps of size h begin after ``first_step`` steps; ``trajectory_numbers`` selects trajectories.
         """
         return self.increments(n_increments, trajectory_numbers, (first_step + np.arange(n_steps)) * h, h, h)
 

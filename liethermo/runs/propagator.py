@@ -378,7 +378,7 @@ class Propagator(metaclass=ListedType):
         if function is None:
             function = (
                 self.with_parameters(parameters)._compiled_final_state_function(t_span, varied_parameters)
-                or _no_compiled_final_state
+                or _final_state_left_to_run
             )
             thread.add((names, key, t_span), function)
         return function(x0)
@@ -406,7 +406,7 @@ class Propagator(metaclass=ListedType):
         return problem if problem.system.inner is None else None
 
 
-def _no_compiled_final_state(x0) -> None:
+def _final_state_left_to_run(x0) -> None:
     """Return None in place of a last state, so that the caller starts a run: there is no machine code."""
 
 
