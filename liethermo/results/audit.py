@@ -305,7 +305,7 @@ class LawCheck:
 
     @property
     def excess(self) -> np.ndarray:
-        """The values less their limits, shape (B,): the trajectory with the largest excess is the worst."""
+        """Measured values minus limits, shape (B,), by which an audit selects the worst trajectory."""
         excess = self.values if self.limits is None else self.values - self.limits
         return excess if self.total_falls is None else np.where(self.total_falls > 0.0, self.total_falls, excess)
 

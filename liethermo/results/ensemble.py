@@ -245,9 +245,11 @@ class Ensemble(AuditableResult):
         is_reached = np.isfinite(self.energy[i]) if has_time_series else np.array([True])
         work = None if self.work is None else self.work[i]
 
-        def series(values, initial_value):
+        def series(values_of_members, initial_value):
             """Return the values of this trajectory at its saved times, or at its start and end."""
-            return values[i][is_reached] if has_time_series else np.stack([initial_value, values[i]])
+            return (
+                values_of_members[i][is_reached] if has_time_series else np.stack([initial_value, values_of_members[i]])
+            )
 
         assert self.x is not None
         first_energy = self.first_energy[i]

@@ -161,11 +161,11 @@ def hermite_defects(vector_field: Callable, steps: StepSample) -> np.ndarray:
         h = sizes[:, None]
         ends = np.stack([x, x_end], axis=1)
         slopes = h[:, None] * vector_field(trajectory, ends)
-        data = [v[:, i : i + 1] for i in (0, 1) for v in (ends, slopes)]
-        cubic_states = sum(c * v for c, v in zip(value_weights, data, strict=True))
+        ends_and_slopes = [v[:, i : i + 1] for i in (0, 1) for v in (ends, slopes)]
+        cubic_states = sum(c * v for c, v in zip(value_weights, ends_and_slopes, strict=True))
         defect = np.abs(
             h[:, None] * vector_field(trajectory, cubic_states)
-            - sum(c * v for c, v in zip(slope_weights, data, strict=True))
+            - sum(c * v for c, v in zip(slope_weights, ends_and_slopes, strict=True))
         ).max(axis=2)
         defects[indices] = np.nan_to_num(defect, nan=0.0, posinf=1e300).mean(axis=1)
     return defects

@@ -51,7 +51,12 @@ class AdaptiveEnsembleRun(EnsembleRun):
     def _run_vmapped_batch(self, padded_members: np.ndarray, n_members: int) -> None:
         group = self.group
         assert group.control is not None
-        arguments = group.family.form, *group.family.vmap_arguments(padded_members), group.method, group.control
+        arguments = (
+            group.family.program_structure,
+            *group.family.vmap_arguments(padded_members),
+            group.method,
+            group.control,
+        )
         adaptive_runs = start_adaptive_runs(
             *arguments, group.x0[padded_members], *self._start_first_stop_and_span_length
         )
@@ -152,11 +157,11 @@ class _BatchRecorder:
         self.is_running[indices] = False
         self.progress_counter.add(np.unique(self.members[indices]).size)
         if self.keep_only is not None and 2 * self.is_running.sum() <= len(self.members) and self.is_running.any():
-            running = np.flatnonzero(self.is_running)
-            self.keep_only(running)
-            self.pause_handler.keep_only(running)
-            self.members, self.is_running = self.members[running], self.is_running[running]
-            self.initial = {name: values[running] for name, values in self.initial.items()}
+            running_indices = np.flatnonzero(self.is_running)
+            self.keep_only(running_indices)
+            self.pause_handler.keep_only(running_indices)
+            self.members, self.is_running = self.members[running_indices], self.is_running[running_indices]
+            self.initial = {name: values[running_indices] for name, values in self.initial.items()}
 
     def record_unfinished_as_interrupted(self) -> None:
         """Record the unfinished trajectories as interrupted."""

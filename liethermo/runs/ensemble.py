@@ -138,8 +138,8 @@ def ensemble(
     refuse_incompatible_options(method, step, noise, until)
     family = Family.from_arguments(system, parameters)
     save_every_step = save_every if outputs == "trajectory" and save_at is None else None
-    declared = DeclaredTimes.from_tree(family.member_with_unknown_parameters())
-    schedule = make_schedule(t_span, step, save_every_step, save_at, breaks=breaks, declared_times=declared)
+    declared_times = DeclaredTimes.from_tree(family.member_with_unknown_parameters())
+    schedule = make_schedule(t_span, step, save_every_step, save_at, breaks=breaks, declared_times=declared_times)
     attitude = attitude_array(attitude, None)
     states, reasons = _checked_initial_states(family, x0s, len(attitude) if np.ndim(attitude) == 3 else 1)
     check_noise(noise, len(states))
@@ -176,7 +176,7 @@ def ensemble(
             options.run_group(group_record, functools.partial(_update_progress, bar, n_done))
             if group_record.is_interrupted:
                 break
-            n_done += len(group_record.numbers)
+            n_done += len(group_record.trajectory_numbers)
     return record.to_ensemble(reasons, provenance, wall_time=time.perf_counter() - start_time)
 
 
@@ -332,16 +332,16 @@ def _find_invalid_rows_by_bisection(error_of_rows: Callable[[slice], str], n_row
     """Return the error texts of invalid rows, by row index, found by bisection of the slices that have an error."""
     reasons: dict[int, str] = {}
 
-    def search_rows(start: int, stop: int) -> None:
+    def bisect_rows(start: int, stop: int) -> None:
         text = error_of_rows(slice(start, stop))
         if text and stop - start == 1:
             reasons[start] = text
         elif text:
-            search_rows(start, (start + stop) // 2)
-            search_rows((start + stop) // 2, stop)
+            bisect_rows(start, (start + stop) // 2)
+            bisect_rows((start + stop) // 2, stop)
 
     for batch_start in range(0, n_rows, DOMAIN_CHECK_BATCH_SIZE):
-        search_rows(batch_start, min(batch_start + DOMAIN_CHECK_BATCH_SIZE, n_rows))
+        bisect_rows(batch_start, min(batch_start + DOMAIN_CHECK_BATCH_SIZE, n_rows))
     return reasons
 
 

@@ -166,7 +166,7 @@ class FixedEnsembleRun(EnsembleRun):
         # bounded memory for increments and saved states
         max_steps = CHUNK_STEPS if group.noise is None else max(1, CHUNK_STEPS * 16 // batch_size)
         max_saves = max(1, min(array_engine.MAX_SAVES_PER_CALL, ARRAY_MAX_SAVED_VALUES // (batch_size * dim)))
-        arguments = group.family.form, *group.family.vmap_arguments(padded_members), group.method
+        arguments = group.family.program_structure, *group.family.vmap_arguments(padded_members), group.method
         batch = array_engine.ArrayBatch(*arguments, group.x0[padded_members])
         calls = group.schedule.engine_calls(max_steps, max_saves)
         self._advance_to_end(batch, padded_members, n_members, calls, lambda: False)
@@ -176,18 +176,20 @@ class FixedEnsembleRun(EnsembleRun):
         batch: CompiledBatch | array_engine.ArrayBatch,
         members: slice | np.ndarray,
         n_members: int,
-        calls: Iterator[EngineCall],
+        engine_calls: Iterator[EngineCall],
         is_stopped: Callable[[], bool],
     ) -> None:
         """Advance a batch of trajectories by the engine calls of a schedule, and record their states and ends."""
         record, group, first_save = self.record, self.group, 1
 
-        def record_call(call: EngineCall, first_step: int, states: np.ndarray) -> bool:
+        def record_call(engine_call: EngineCall, first_step: int, saved_states: np.ndarray) -> bool:
             nonlocal first_save
-            if call.keep:
-                record.store_consecutive_saves(members, first_save, states)
-                first_save += call.n_saves
-            self.progress_counter.add(n_members * call.n_saves * call.steps_per_save / group.schedule.n_steps)
+            if engine_call.are_states_saved:
+                record.store_consecutive_saves(members, first_save, saved_states)
+                first_save += engine_call.n_saves
+            self.progress_counter.add(
+                n_members * engine_call.n_saves * engine_call.steps_per_save / group.schedule.n_steps
+            )
             return not is_stopped()
 
         with self._record_lock:
@@ -195,7 +197,7 @@ class FixedEnsembleRun(EnsembleRun):
             record.store_initial_states(members, initial["x"], initial["energy"], initial["entropy"])
         noise = None if group.noise is None else functools.partial(group.noise.step_increments, members)
         try:
-            take_scheduled_steps(batch, calls, record_call, noise)
+            take_scheduled_steps(batch, engine_calls, record_call, noise)
         except KeyboardInterrupt:
             self.is_interrupted = True
         with self._record_lock:

@@ -74,8 +74,8 @@ class EventSet:
         system. Its attributes ``terminal`` (True, False or the number of zeros that ends the run; by default True) and
         ``direction`` mean what they mean in SciPy.
     system : System
-        The system as it is run.
-    t, x : float and array, shape (n,)
+        The prepared system that the engines run.
+    start_time, initial_state : float and array, shape (n,)
         The initial time and state.
 
     Attributes
@@ -87,10 +87,10 @@ class EventSet:
     rules : EventRules
     """
 
-    def __init__(self, until: Until | EventSpecification, system: System, t: float, x):
+    def __init__(self, until: Until | EventSpecification, system: System, start_time: float, initial_state):
         specification = until if isinstance(until, EventSpecification) else EventSpecification(until)
         events = [
-            _make_event(event, number, n_counted_before, specification, system, t, x)
+            _make_event(event, number, n_counted_before, specification, system, start_time, initial_state)
             for number, (event, n_counted_before) in enumerate(
                 zip(specification.events, specification.n_counted_before, strict=True)
             )
@@ -139,8 +139,8 @@ def _make_event(
     n_counted_before: int,
     specification: EventSpecification,
     system: System,
-    t: float,
-    x,
+    start_time: float,
+    initial_state,
 ) -> tuple[str, RateAboveThreshold | EventFunction, int, int | None, bool]:
     """Return name, function, direction, terminal count and ``counts_jumps`` of an event: see :class:`EventRules`."""
     scipy_arguments = specification.scipy_arguments
@@ -151,7 +151,7 @@ def _make_event(
     name = "the event function" if len(specification.events) == 1 else f"event function {event_index}"
     direction = int(np.sign(event_direction(user_event)))
     count = _n_zeros_to_end_run(user_event, default_terminal=scipy_arguments is None)
-    function = _trace_event_function(user_event, name, scipy_arguments, system, t, x)
+    function = _trace_event_function(user_event, name, scipy_arguments, system, start_time, initial_state)
     return name, function, direction, None if count is None else count - n_counted_before, scipy_arguments is not None
 
 
@@ -175,7 +175,7 @@ def _n_zeros_to_end_run(event_function: Any, default_terminal: bool) -> int | No
     return int(terminal)
 
 
-def _rate_below_tolerance_event(relaxed: Relaxed, system: System) -> tuple[str, RateAboveThreshold]:
+def _rate_below_tolerance_event(relaxation: Relaxed, system: System) -> tuple[str, RateAboveThreshold]:
     """Return the name and the function of the event that the entropy production, or energy loss, falls below tol."""
     if system.entropy_law == "nondecreasing":  # the laws say which rate vanishes as the system relaxes
         rate, name = "entropy_production", "entropy production"
@@ -186,7 +186,7 @@ def _rate_below_tolerance_event(relaxed: Relaxed, system: System) -> tuple[str, 
             "Relaxed(tol) needs a system that produces entropy or loses energy, and this system promises neither. Give "
             "a function of the state as until"
         )
-    return f"{name} below {relaxed.tol:g}", RateAboveThreshold(jnp.asarray(relaxed.tol), rate)
+    return f"{name} below {relaxation.tol:g}", RateAboveThreshold(jnp.asarray(relaxation.tol), rate)
 
 
 class RateAboveThreshold(Module):
@@ -222,12 +222,12 @@ class EventFunction(Module):
         return self.function(*event_arguments(self.names, system, t, x))
 
 
-def event_arguments(names: Sequence[str], system: System, t, x) -> tuple:
+def event_arguments(argument_names: Sequence[str], system: System, t, x) -> tuple:
     """Return the arguments of an event function at time t and state x of a prepared system.
 
     The parameters are one array, of all parameters one after another: see :func:`parameter_values`.
     """
-    return tuple(_event_argument_by_name(name, system, t, x) for name in names)
+    return tuple(_event_argument_by_name(name, system, t, x) for name in argument_names)
 
 
 def _event_argument_by_name(name: str, system: System, t, x):
@@ -246,7 +246,12 @@ def _parameters_of_user_system(system: System) -> list:
 
 
 def _trace_event_function(
-    user_function: Callable, name: str, scipy_arguments: tuple | None, system: System, t: float, x
+    user_function: Callable,
+    event_name: str,
+    scipy_arguments: tuple | None,
+    system: System,
+    start_time: float,
+    initial_state,
 ) -> EventFunction:
     """Return a user's event function in the form of the engines: traced, or called in Python if it cannot be traced.
 
@@ -259,9 +264,9 @@ def _trace_event_function(
     """
     names = ("t", "x") if scipy_arguments is not None else _event_argument_names(user_function)
     if "attitude" in names and system.attitude_layout is None:
-        raise InputError(f"{name} asks for the attitude, and this system has none. Give it a group")
+        raise InputError(f"{event_name} asks for the attitude, and this system has none. Give it a group")
     call = _pass_parameters_and_extra_arguments(user_function, names, scipy_arguments or (), system)
-    example = jax.eval_shape(lambda t, x: event_arguments(names, system, t, x), jnp.zeros(()), x)
+    example = jax.eval_shape(lambda t, x: event_arguments(names, system, t, x), jnp.zeros(()), initial_state)
     shapes = [argument.shape for argument in example]
     state_shape = jax.eval_shape(system.user_state, jax.ShapeDtypeStruct((system.dim,), jnp.float64)).shape
     failure: Exception | None = None
@@ -270,32 +275,32 @@ def _trace_event_function(
             traced_function = trace_callables(traceable, lambda f, *a: f(*a), *shapes)
             value = jax.eval_shape(traced_function, *example)
         except IndexOutOfRangeError as error:
-            raise error.with_function(f"{name}, at a state of shape {state_shape},") from None
+            raise error.with_function(f"{event_name}, at a state of shape {state_shape},") from None
         except TRACE_ERRORS as error:
             failure = failure or error
         else:
-            _check_result_is_scalar(value, name)
+            _check_result_is_scalar(value, event_name)
             return EventFunction(traced_function, names)
     assert failure is not None
-    arguments = [np.asarray(a) for a in event_arguments(names, system, t, jnp.asarray(x))]
+    arguments = [np.asarray(a) for a in event_arguments(names, system, start_time, jnp.asarray(initial_state))]
     try:
         result = call(*arguments)
         number = np.asarray(np.empty(0) if result is None else result, dtype=np.float64)
     except Exception as error:
-        description = f"{name} could not be evaluated on a state of shape {state_shape}"
+        description = f"{event_name} could not be evaluated on a state of shape {state_shape}"
         raise FunctionError(trace_error_message(description, failure)) from error
     if result is None:
-        raise FunctionError(trace_error_message(f"{name} could not be evaluated", failure))
-    _check_result_is_scalar(number, name)
+        raise FunctionError(trace_error_message(f"{event_name} could not be evaluated", failure))
+    _check_result_is_scalar(number, event_name)
     return EventFunction(PythonCall(call), names)
 
 
-def _check_result_is_scalar(result, name: str) -> None:
+def _check_result_is_scalar(result, function_name: str) -> None:
     shape = getattr(result, "shape", None)
     if shape != ():
+        description = type(result).__name__ if shape is None else f"shape {shape}"
         raise FunctionError(
-            f"{name} must return one number, got {type(result).__name__ if shape is None else f'shape {shape}'}. For "
-            "several events, give a list of functions"
+            f"{function_name} must return one number, got {description}. For several events, give a list of functions"
         )
 
 
@@ -319,11 +324,11 @@ def _event_argument_names(function: Callable) -> tuple[str, ...]:
 
 
 def _pass_parameters_and_extra_arguments(
-    function: Callable, names: Sequence[str], extra_arguments: tuple, system: System
+    user_function: Callable, argument_names: Sequence[str], extra_arguments: tuple, system: System
 ) -> Callable:
-    """Return a function that passes parameters as a dict or system, and ``extra_arguments`` at the end, to a user's."""
-    if not extra_arguments and not {"parameters", "system"} & set(names):
-        return function
+    """Return a function that calls the user's one, with its parameters as a dict or system and with extra arguments."""
+    if not extra_arguments and not {"parameters", "system"} & set(argument_names):
+        return user_function
     tree = eqx.filter(user_system(system), eqx.is_inexact_array)
     paths, structure = jax.tree_util.tree_flatten_with_path(tree)
     static = eqx.filter(user_system(system), eqx.is_inexact_array, inverse=True)
@@ -332,19 +337,19 @@ def _pass_parameters_and_extra_arguments(
 
     def call(*arguments):
         values = list(arguments)
-        for i, name in enumerate(names):
+        for i, name in enumerate(argument_names):
             if name in ("parameters", "system"):
-                parts, offset = [], 0
+                parameter_arrays, offset = [], 0
                 for shape in shapes:
                     size = math.prod(shape)
-                    parts.append(values[i][offset : offset + size].reshape(shape))
+                    parameter_arrays.append(values[i][offset : offset + size].reshape(shape))
                     offset += size
                 values[i] = (
-                    dict(zip(labels, parts, strict=True))
+                    dict(zip(labels, parameter_arrays, strict=True))
                     if name == "parameters"
-                    else eqx.combine(jax.tree_util.tree_unflatten(structure, parts), static)
+                    else eqx.combine(jax.tree_util.tree_unflatten(structure, parameter_arrays), static)
                 )
-        return function(*values, *extra_arguments)
+        return user_function(*values, *extra_arguments)
 
     return call
 

@@ -86,7 +86,7 @@ MAX_REPLAYED_STEPS = 256
 
 @dataclass(frozen=True, eq=False)
 class EngineReplay:
-    """Replays steps of one trajectory with the engine of its run."""
+    """Replay of steps of a single run, one after another, with the engine of the run."""
 
     engine: EngineWithFallback
 
@@ -135,7 +135,7 @@ class EngineReplay:
 
 @dataclass(frozen=True, eq=False)
 class LaneReplay:
-    """Replays steps of the trajectories of an ensemble, all at once.
+    """Replay of steps of the trajectories of an ensemble, many at once, in lanes of an engine.
 
     Attributes
     ----------
@@ -231,8 +231,8 @@ class StepChecker:
         """
         indices, defects = self._select_worst_and_spaced_steps(sample)
         trajectories, first_steps = np.unique(sample.trajectory, return_index=True)
-        others = first_steps[~np.isin(trajectories, sample.trajectory[indices])]
-        steps = sample.select(np.append(indices, others))
+        other_indices = first_steps[~np.isin(trajectories, sample.trajectory[indices])]
+        steps = sample.select(np.append(indices, other_indices))
         replayed_steps = self._replay_in_substeps(steps, self._field_change_by_rounding(steps))
         for field_rounding in (None, self._rounding_scale_of_field):
             if field_rounding is not None:
@@ -240,19 +240,24 @@ class StepChecker:
                     field_rounding_floor=np.fmax(replayed_steps.field_rounding_floor, field_rounding(steps))
                 )
             relative_displacement = self._relative_displacements(replayed_steps)
-            moving = np.flatnonzero(replayed_steps.is_completed & (relative_displacement > MIN_RELATIVE_MOTION))
-            if not moving.size:
+            moving_indices = np.flatnonzero(replayed_steps.is_completed & (relative_displacement > MIN_RELATIVE_MOTION))
+            if not moving_indices.size:
                 return evidence
-            inconsistency = self._inconsistency_with_field(replayed_steps.select(moving), relative_displacement[moving])
+            inconsistency = self._inconsistency_with_field(
+                replayed_steps.select(moving_indices), relative_displacement[moving_indices]
+            )
             if len(self.system.state_blocks) == 1 or inconsistency is None or inconsistency <= CONSISTENCY_SKIP_LEVEL:
                 break
         evidence = dataclasses.replace(evidence, inconsistency=inconsistency)
         errors = self._local_errors_by_substeps(replayed_steps.select(np.arange(len(indices))), defects)
         if errors is None:
             return evidence
-        worst = int(np.argmax(errors))
+        worst_index = int(np.argmax(errors))
         return dataclasses.replace(
-            evidence, local_error=float(errors[worst]), error_time=float(steps.t[worst]), looked=len(sample.h)
+            evidence,
+            local_error=float(errors[worst_index]),
+            error_time=float(steps.t[worst_index]),
+            looked=len(sample.h),
         )
 
     def _select_worst_and_spaced_steps(self, sample: StepSample) -> tuple[np.ndarray, np.ndarray]:
@@ -297,16 +302,16 @@ class StepChecker:
         So if short steps from a state have a defect, others begin at the end of the first.
         """
         h = replayed_steps.steps.h
-        moving = np.flatnonzero(relative_displacement > 1e-6 * (relative_displacement / h).max() * h)
-        _, first_steps_of_trajectories = np.unique(replayed_steps.steps.trajectory[moving], return_index=True)
-        evenly_spaced = evenly_spaced_indices(len(moving), CONSISTENCY_STATES)
-        moving = moving[np.union1d(evenly_spaced, first_steps_of_trajectories)]
+        moving_indices = np.flatnonzero(relative_displacement > 1e-6 * (relative_displacement / h).max() * h)
+        _, first_steps_of_trajectories = np.unique(replayed_steps.steps.trajectory[moving_indices], return_index=True)
+        evenly_spaced = evenly_spaced_indices(len(moving_indices), CONSISTENCY_STATES)
+        moving_indices = moving_indices[np.union1d(evenly_spaced, first_steps_of_trajectories)]
         h, relative_displacement, field_rounding_floor = (
-            h[moving],
-            relative_displacement[moving],
-            replayed_steps.field_rounding_floor[moving],
+            h[moving_indices],
+            relative_displacement[moving_indices],
+            replayed_steps.field_rounding_floor[moving_indices],
         )
-        steps = replayed_steps.steps.select(moving)._replace(
+        steps = replayed_steps.steps.select(moving_indices)._replace(
             h=np.minimum(h, SHORT_STEP_FRACTION * h / relative_displacement)
         )
         defects, first_steps = self._smallest_defects_of_shorter_steps(steps, field_rounding_floor)
@@ -330,9 +335,9 @@ class StepChecker:
             steps.select(step_indices)._replace(h=sizes.ravel()), field_rounding_floor[step_indices]
         )
         defects = np.full(len(step_indices), np.nan)
-        completed = np.flatnonzero(replayed_steps.is_completed)
-        if completed.size:
-            defects[completed] = self._slope_defects_relative_to_field(replayed_steps.select(completed))
+        completed_indices = np.flatnonzero(replayed_steps.is_completed)
+        if completed_indices.size:
+            defects[completed_indices] = self._slope_defects_relative_to_field(replayed_steps.select(completed_indices))
         finite_defects = np.where(np.isfinite(defects), defects, np.nan).reshape(-1, STEP_REFINEMENTS)
         return np.fmin.reduce(finite_defects, axis=1), replayed_steps.select(
             np.arange(0, len(step_indices), STEP_REFINEMENTS)
@@ -399,21 +404,21 @@ class StepChecker:
             scales = self.evaluate(_rounding_scale_of_vector_field, steps.trajectory, steps.x)
             return self._maximum_over_each_block(ROUNDING_SLOPE_RTOL * scales)
 
-    def _evaluate_field(self, trajectory_indices: np.ndarray, x: np.ndarray) -> np.ndarray:
+    def _evaluate_field(self, trajectory_indices: np.ndarray, states: np.ndarray) -> np.ndarray:
         """Return the vector field at states, shape (m, ..., n), of trajectories, shape (m,)."""
-        rows = x.reshape(-1, x.shape[-1])
+        rows = states.reshape(-1, states.shape[-1])
         with np.errstate(all="ignore"):
             field = self.evaluate(
                 vector_field, np.repeat(trajectory_indices, len(rows) // len(trajectory_indices)), rows
             )
-        return np.asarray(field).reshape(x.shape)
+        return np.asarray(field).reshape(states.shape)
 
     def _maximum_over_each_block(self, values: np.ndarray) -> np.ndarray:
         return np.stack([values[:, block].max(axis=1, initial=0.0) for block in self.system.state_blocks], axis=1)
 
-    def _to_user_states(self, x: np.ndarray) -> np.ndarray:
+    def _to_user_states(self, states: np.ndarray) -> np.ndarray:
         """Convert states, shape (m, n), to flat states in the user's form, shape (m, k)."""
-        return np.asarray(self.system.points(x)).reshape(len(x), -1)
+        return np.asarray(self.system.points(states)).reshape(len(states), -1)
 
 
 def _divide_unless_zero(numerators: np.ndarray, denominators: np.ndarray) -> np.ndarray:
@@ -431,10 +436,8 @@ class RunEvidenceSource:
     method : OneStepMethod or Reference
     functions : dict of Energy
         Recorded functions besides energy and entropy.
-    x : ndarray, shape (m, n)
-        Saved states.
-    t : ndarray, shape (m,)
-        Times of the states.
+    saved_states : ndarray, shape (m, n)
+    saved_times : ndarray, shape (m,)
     step_sizes : function without arguments to an array, shape at most (m,)
         Sizes of the steps that the run took from the states.
     replay : EngineReplay
@@ -443,8 +446,8 @@ class RunEvidenceSource:
     system: System
     method: Any
     functions: Mapping[str, Energy]
-    x: np.ndarray
-    t: np.ndarray
+    saved_states: np.ndarray
+    saved_times: np.ndarray
     step_sizes: Callable[[], np.ndarray]
     replay: EngineReplay
 
@@ -454,23 +457,27 @@ class RunEvidenceSource:
     @functools.cached_property
     def _evidence(self) -> Evidence:
         functions = {**energy_and_entropy_by_name(self.system), **self.functions}
-        sample_indices = evenly_spaced_indices(len(self.x), MAX_SENSITIVITY_STATES)
-        sampled_x, guarantees = self.x[sample_indices], frozenset(self.method.preserves)
+        sample_indices = evenly_spaced_indices(len(self.saved_states), MAX_SENSITIVITY_STATES)
+        sampled_x, guarantees = self.saved_states[sample_indices], frozenset(self.method.preserves)
         scales = evaluate_at_points(sensitivities_and_rounding_scales, tuple(functions.values()), sampled_x)
         sensitivities, terms = (dict(zip(functions, finite_column_maxima(columns), strict=True)) for columns in scales)
         energy, entropy = sensitivities.pop("energy"), sensitivities.pop("entropy", None)
-        conditions = self.system.run_conditions(sampled_x, np.asarray(self.t)[sample_indices], guarantees)
+        conditions = self.system.run_conditions(sampled_x, np.asarray(self.saved_times)[sample_indices], guarantees)
         evidence = Evidence(energy, entropy, sensitivities, terms, conditions=conditions)
         if not has_noiseless_steps(self.method) or not len(h := self.step_sizes()):
             return evidence
         user_states = np.asarray(self.system.points(sampled_x)).reshape(len(sampled_x), -1).view(np.float64)
         min_motion = MIN_MOTION_FRACTION * np.ptp(user_states, axis=0).max(keepdims=True)
         sample = sample_steps_of_run(
-            self.system, self.x[: len(h) + 1], self.t[: len(h) + 1], h, self.replay.states_after_each_step
+            self.system,
+            self.saved_states[: len(h) + 1],
+            self.saved_times[: len(h) + 1],
+            h,
+            self.replay.states_after_each_step,
         )
 
-        def evaluate(function: Callable, trajectory: np.ndarray, x: np.ndarray) -> Any:
-            return evaluate_at_points(function, self.system, x)
+        def evaluate(function: Callable, trajectory_indices: np.ndarray, states: np.ndarray) -> Any:
+            return evaluate_at_points(function, self.system, states)
 
         return StepChecker(self.system, evaluate, self.replay, min_motion).add_error_and_inconsistency(evidence, sample)
 
@@ -481,17 +488,15 @@ class GroupEvidenceSource:
 
     Attributes
     ----------
-    member : System
+    example_member : System
         One member of the family.
     replay : LaneReplay
         Replays steps of the trajectories, with their family and method.
-    x : ndarray, shape (B, n)
-        Initial states.
+    initial_states : ndarray, shape (B, n)
     start_time : float
-    h : ndarray, shape (B,)
-        Sizes of the first steps.
+    first_step_sizes : ndarray, shape (B,)
     n_equal_steps : ndarray of int, shape (B,)
-        Numbers of steps of these sizes that the trajectories took.
+        Number of consecutive steps of this size that each trajectory took.
     distance : ndarray, shape (B,)
         Distances from the initial to the final states.
     saved_states : sequence of ndarray, shape (times, n)
@@ -499,11 +504,11 @@ class GroupEvidenceSource:
     saved_times : ndarray, shape (times,)
     """
 
-    member: System
+    example_member: System
     replay: LaneReplay
-    x: np.ndarray
+    initial_states: np.ndarray
     start_time: float
-    h: np.ndarray
+    first_step_sizes: np.ndarray
     n_equal_steps: np.ndarray
     distance: np.ndarray
     saved_states: Sequence[np.ndarray] | np.ndarray
@@ -512,8 +517,10 @@ class GroupEvidenceSource:
     @np.errstate(over="ignore", invalid="ignore")  # overflowed states have the status non_finite
     def __call__(self) -> Evidence:
         family, guarantees = self.replay.family, frozenset(self.replay.method.preserves)
-        scales = family.evaluate(energy_and_entropy_rounding_scales, slice(None), self.x).max(axis=0)
-        terms = dict(zip(energy_and_entropy_by_name(self.member), map(float, np.nan_to_num(scales)), strict=True))
+        scales = family.evaluate(energy_and_entropy_rounding_scales, slice(None), self.initial_states).max(axis=0)
+        terms = dict(
+            zip(energy_and_entropy_by_name(self.example_member), map(float, np.nan_to_num(scales)), strict=True)
+        )
         known_states = [states[np.isfinite(states).all(axis=1)] for states in self.saved_states]
         conditions = worst_conditions(
             family.member(i).run_conditions(states, self.saved_times, guarantees)
@@ -521,15 +528,17 @@ class GroupEvidenceSource:
         )
         drifts = largest_drifts(self._invariant_drifts_of_member(i, states) for i, states in enumerate(known_states))
         evidence = Evidence(terms=terms, conditions=conditions, drifts=drifts)
-        n_steps = np.fmin(self.n_equal_steps, max(1, MAX_SAMPLED_VALUES // (REPLAY_COST_RATIO * self.x.size)))
+        n_steps = np.fmin(
+            self.n_equal_steps, max(1, MAX_SAMPLED_VALUES // (REPLAY_COST_RATIO * self.initial_states.size))
+        )
         if self.replay.engine != "compiled":
             n_steps = np.fmin(n_steps, MAX_REPLAYED_STEPS)
         if not has_noiseless_steps(self.replay.method) or not n_steps.any():
             return evidence
-        sample = self.replay.replay_first_steps(self.x, self.h, self.start_time, n_steps)
+        sample = self.replay.replay_first_steps(self.initial_states, self.first_step_sizes, self.start_time, n_steps)
         if not len(sample.h):
             return evidence
-        checker = StepChecker(self.member, family.evaluate, self.replay, MIN_MOTION_FRACTION * self.distance)
+        checker = StepChecker(self.example_member, family.evaluate, self.replay, MIN_MOTION_FRACTION * self.distance)
         return checker.add_error_and_inconsistency(evidence, sample)
 
     def _invariant_drifts_of_member(self, i: int, saved_states: np.ndarray) -> dict[str, InvariantDrift]:

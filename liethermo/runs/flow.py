@@ -354,11 +354,11 @@ def _integrate_path(
             )
             return new_carry, (*carry[:2], new_carry[2]) if return_slopes else None
 
-        def save(carry, _, step=step, steps_per_save=n_substeps):
+        def take_steps_of_save(carry, _, step=step, steps_per_save=n_substeps):
             carry, solved_steps = jax.lax.scan(step, carry, length=steps_per_save)
             return carry, (carry[0], solved_steps)
 
-        carry, (saved_states, call_steps) = jax.lax.scan(save, carry, length=n_saves)
+        carry, (saved_states, call_steps) = jax.lax.scan(take_steps_of_save, carry, length=n_saves)
         states.append(saved_states)
         steps.append(call_steps)
     return _concatenate_or_take_final(states, final_only), steps
@@ -420,11 +420,11 @@ def _differentiable_path_from_solved_steps(
             k = _attach_implicit_derivative_to_slopes(step_system, method, x, compensation, h, k)
             return method.move(step_system, x, compensation, h, k)[0], None
 
-        def save(x, steps_of_save, step=step):
+        def take_steps_of_save(x, steps_of_save, step=step):
             x, _ = jax.lax.scan(step, x, steps_of_save)
             return x, x
 
-        initial_state, saved_states = jax.lax.scan(save, initial_state, call_steps)
+        initial_state, saved_states = jax.lax.scan(take_steps_of_save, initial_state, call_steps)
         states.append(saved_states)
     return _concatenate_or_take_final(states, final_only)
 
@@ -483,14 +483,16 @@ def _solve_stages_with_implicit_derivative(
     system: System, method: OneStepMethod, x, compensation, h, guess, stage_solver: Callable
 ) -> jax.Array:
     """Return the slopes that ``stage_solver`` computes, with the derivative from the implicit function theorem."""
-    dynamic, static = eqx.partition((system, method, x, compensation, h), eqx.is_array)
+    array_leaves, static = eqx.partition((system, method, x, compensation, h), eqx.is_array)
 
-    def slopes(dynamic, k):
-        system, method, x, compensation, h = eqx.combine(dynamic, static)
+    def slopes(array_leaves, k):
+        system, method, x, compensation, h = eqx.combine(array_leaves, static)
         return method.slopes(system, x, compensation, h, k)
 
-    def solution(dynamic, guess):
-        system, method, x, compensation, h = eqx.combine(dynamic, static)
+    def solve_from_arrays(array_leaves, guess):
+        system, method, x, compensation, h = eqx.combine(array_leaves, static)
         return stage_solver(stage_equations(system, method, x, compensation, h, guess, guess)._replace(guess=guess))
 
-    return solve_with_implicit_derivative(solution, lambda dynamic, k: slopes(dynamic, k) - k, dynamic, guess)
+    return solve_with_implicit_derivative(
+        solve_from_arrays, lambda dynamic, k: slopes(dynamic, k) - k, array_leaves, guess
+    )

@@ -53,8 +53,10 @@ _implicit_solution = Primitive("solution")
 
 
 def _run_solver(*arguments, solve: Callable, residual: Callable, structure, vmap_axes: tuple) -> jax.Array:
-    """Return the solution of the solver, vectorised by each enclosing ``vmap``, whose argument axes are in
-    ``vmap_axes``, innermost first."""
+    """Run ``solve`` under one ``jax.vmap`` for each entry of ``vmap_axes``, innermost first, and return the solution.
+
+    An entry holds the axes of the arguments that an enclosing ``vmap`` maps over.
+    """
     del residual
 
     def solve_one(*arguments):
@@ -105,8 +107,8 @@ def _jvp_rule(primals, tangents, *, residual: Callable, structure, vmap_axes: tu
 
         def active_residual(k, *values):
             leaf_values = list(leaves)
-            for i, value in zip(active, values, strict=True):
-                leaf_values[i] = value
+            for i, leaf_value in zip(active, values, strict=True):
+                leaf_values[i] = leaf_value
             return residual(jax.tree_util.tree_unflatten(structure, leaf_values), k)
 
         _, residual_jvp = jax.linearize(active_residual, k, *(leaves[i] for i in active))
@@ -191,7 +193,7 @@ def _mixed_directional_derivative(step_function: _StepFunction, point_row) -> ja
     n = np.size(step_function.system_method_state[-1])
     h, compensation, rows = point_row[0], point_row[1 : 1 + n], point_row[1 + n :].reshape(2**step_function.order, -1)
 
-    def value(rows):
+    def step_of_first_row(rows):
         return step_function(h, compensation, rows[0])[None]
 
     def differentiate(function):
@@ -201,7 +203,7 @@ def _mixed_directional_derivative(step_function: _StepFunction, point_row) -> ja
 
         return value_and_tangent
 
-    function = value
+    function = step_of_first_row
     for _ in range(step_function.order):
         function = differentiate(function)
     return function(rows)[-1]

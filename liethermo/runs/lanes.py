@@ -27,7 +27,12 @@ class CompiledLanes:
         self.first_lane_parameters = np.append(family.parameter_matrix(slice(0, 1), 1)[0], self.shared_parameters)
         self.is_per_trajectory = np.append(family.is_per_trajectory, np.zeros(len(self.shared_parameters), dtype=bool))
         self.step_loop = cached_step_loop(
-            family.form, self.first_lane_parameters, method, control, LANES_PER_BLOCK, self.is_per_trajectory
+            family.program_structure,
+            self.first_lane_parameters,
+            method,
+            control,
+            LANES_PER_BLOCK,
+            self.is_per_trajectory,
         )
 
     def start_compiled_batch(self, members: slice, initial_states: np.ndarray) -> CompiledBatch:
@@ -102,7 +107,7 @@ def replay_steps(
     else:
         # filled up with copies of the last member to a power of two: few numbers of lanes, few programs
         rows = np.minimum(np.arange(1 << (len(initial_states) - 1).bit_length()), len(initial_states) - 1)
-        arguments = family.form, *family.vmap_arguments(rows), method
+        arguments = family.program_structure, *family.vmap_arguments(rows), method
         batch, step_sizes = (
             ArrayBatch(*arguments, initial_states[rows], min_capacity=REPLAY_STEPS_PER_CALL),
             step_sizes[rows],

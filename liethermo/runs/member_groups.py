@@ -140,7 +140,7 @@ def common_inertia(family: Family) -> np.ndarray | None:
         return inertia
     parameters = family.parameter_matrix(slice(None), family.size)
     for rows in (parameters[[0, -1]], parameters):  # two are enough to see that they differ
-        inverses = evaluate_at_points(_inverse_inertia, (family.form, parameters.shape[1]), rows)
+        inverses = evaluate_at_points(_inverse_inertia, (family.program_structure, parameters.shape[1]), rows)
         if not (inverses == inverses[0]).all():
             return None
     return inertia
@@ -152,27 +152,31 @@ def members_outside_domain(family: Family, initial_states: np.ndarray) -> list[i
         return []
     parameters = family.parameter_matrix(slice(None), len(initial_states))
     margins = evaluate_at_points(
-        _domain_margin, (family.form, parameters.shape[1]), np.concatenate([parameters, initial_states], axis=1)
+        _domain_margin,
+        (family.program_structure, parameters.shape[1]),
+        np.concatenate([parameters, initial_states], axis=1),
     )
     return np.flatnonzero(~(margins > 0.0)).tolist()
 
 
 class _MemberInvariantTests:
-    """Tests which functions each member of a family conserves, at random states and near its initial state.
+    """Tests of the functions that each member of a family conserves, at random states and near its initial state.
 
     Parameters
     ----------
     family : Family
-    member : System
+    example_member : System
         One member; all members have functions of the same names.
     method : OneStepMethod
-    states : array, shape (B, n)
+    initial_states : array, shape (B, n)
     """
 
-    def __init__(self, family: Family, member: System, method: OneStepMethod, states: np.ndarray):
-        self.family, self.member, self.states = family, member, states
-        self.requested_functions = method.requested_invariants(member)
-        self.casimirs = tuple(name for name in member.casimirs() if name not in invariants_by_construction(member))
+    def __init__(self, family: Family, example_member: System, method: OneStepMethod, initial_states: np.ndarray):
+        self.family, self.member, self.states = family, example_member, initial_states
+        self.requested_functions = method.requested_invariants(example_member)
+        self.casimirs = tuple(
+            name for name in example_member.casimirs() if name not in invariants_by_construction(example_member)
+        )
 
     # -- facts --------------------------------------------------------------------------------------------------------
 
@@ -333,7 +337,9 @@ class _MemberInvariantTests:
             [np.repeat(parameters, points.shape[1], axis=0), points.reshape(-1, points.shape[-1])], axis=1
         )
         with np.errstate(all="ignore"):
-            values = evaluate_at_points(function, (self.family.form, parameters.shape[1], *function_arguments), inputs)
+            values = evaluate_at_points(
+                function, (self.family.program_structure, parameters.shape[1], *function_arguments), inputs
+            )
         leading = points.shape[:2]
         if isinstance(values, tuple):
             return type(values)(*(np.asarray(a).reshape(*leading, *np.shape(a)[1:]) for a in values))
@@ -349,7 +355,9 @@ class _MemberInvariantTests:
         if not baths.number or not any(self.family.has_member_axis):
             return points
         parameters = self.family.parameter_matrix(member_indices, len(member_indices))
-        scales = evaluate_at_points(_bath_entropy_scales, (self.family.form, parameters.shape[1]), parameters)[:, None]
+        scales = evaluate_at_points(
+            _bath_entropy_scales, (self.family.program_structure, parameters.shape[1]), parameters
+        )[:, None]
         points = points.copy()
         points[..., self.member.body_dim :] *= scales / baths.scale
         return points
@@ -367,51 +375,51 @@ class _MemberInvariantTests:
 
 
 def _unpack_member_and_state(
-    form, n_parameters: int, row, test_time_index: int | None = None
+    structure, n_parameters: int, row, test_time_index: int | None = None
 ) -> tuple[System, jnp.ndarray]:
     """Return the member and the state in a row of parameters and a state; a driven member is taken at a test time."""
-    system = form.build(row[:n_parameters])
+    system = structure.build(row[:n_parameters])
     return (system if test_time_index is None else systems_at_test_times(system)[test_time_index]), row[n_parameters:]
 
 
 def _gradients_of_functions_for_naming(model, row):
-    form, p = model
-    system, x = _unpack_member_and_state(form, p, row)
+    structure, n_parameters = model
+    system, x = _unpack_member_and_state(structure, n_parameters, row)
     return stack_gradients(functions_for_naming(system), x)
 
 
 def _rates_of_casimirs_and_preserved_functions(model, row):
-    form, p, casimirs, time = model
-    system, x = _unpack_member_and_state(form, p, row, time)
+    structure, n_parameters, casimirs, time = model
+    system, x = _unpack_member_and_state(structure, n_parameters, row, time)
     casimir_functions = system.casimirs()
     return rates_of_change((system, (*(casimir_functions[name] for name in casimirs), *system.preserved)), x)
 
 
 def _rates_of_requested_functions(model, row):
-    form, p, functions, time = model
-    system, x = _unpack_member_and_state(form, p, row, time)
+    structure, n_parameters, functions, time = model
+    system, x = _unpack_member_and_state(structure, n_parameters, row, time)
     return rates_of_change((system, functions), x)
 
 
 def _casimir_residuals_of_requested_functions(model, row):
-    form, p, functions = model
-    system, x = _unpack_member_and_state(form, p, row)
+    structure, n_parameters, functions = model
+    system, x = _unpack_member_and_state(structure, n_parameters, row)
     return casimir_residuals((system, functions), x)
 
 
 def _bath_entropy_scales(model, row):
-    form, p = model
-    system, _ = _unpack_member_and_state(form, p, row)
+    structure, n_parameters = model
+    system, _ = _unpack_member_and_state(structure, n_parameters, row)
     return system.baths.entropy_scales()
 
 
 def _domain_margin(model, row):
-    form, p = model
-    system, x = _unpack_member_and_state(form, p, row)
+    structure, n_parameters = model
+    system, x = _unpack_member_and_state(structure, n_parameters, row)
     return system.domain.margin_at(x)
 
 
 def _inverse_inertia(model, row):
-    form, p = model
-    body = _unpack_member_and_state(form, p, row)[0].drop_baths()
+    structure, n_parameters = model
+    body = _unpack_member_and_state(structure, n_parameters, row)[0].drop_baths()
     return jax.jacfwd(body.energy.gradient)(jnp.zeros(body.dim))

@@ -37,14 +37,14 @@ class NamedParameter(NamedTuple):
     Attributes
     ----------
     value : ndarray
-    leaves : tuple of int
+    leaf_indices : tuple of int
         Numbers of the arrays of the system that hold the parameter, in the order of :func:`parameter_arrays`.
     is_inverse : bool
         Whether these arrays hold the inverse, as those of an energy with moments of inertia do.
     """
 
     value: np.ndarray
-    leaves: tuple[int, ...]
+    leaf_indices: tuple[int, ...]
     is_inverse: bool = False
 
     def to_stored_array(self, value):
@@ -89,7 +89,7 @@ def replace_parameters(system: System, parameter_values: Mapping[str, Any]) -> S
         if array.shape != parameter.value.shape:
             raise InputError(f"{name} must have shape {parameter.value.shape}, got {array.shape}")
         _record_name_of_leaves(names_by_leaf, name, parameter)
-        for i in parameter.leaves:
+        for i in parameter.leaf_indices:
             leaves[i] = real_array(parameter.to_stored_array(array))
             if i in conditions:
                 require_condition(leaves[i], conditions[i].test, conditions[i].template)
@@ -186,7 +186,7 @@ def stack_member_arrays(system: System, member_values: Mapping[str, Any]) -> lis
             expected_shape = ", ".join(["trajectories", *map(str, parameter.value.shape)])
             raise InputError(f"the values of {name} must have shape ({expected_shape}), got {array.shape}")
         _record_name_of_leaves(names_by_leaf, name, parameter)
-        for i in parameter.leaves:
+        for i in parameter.leaf_indices:
             leaves[i] = np.asarray(parameter.to_stored_array(array))
     return leaves
 
@@ -217,7 +217,7 @@ def find_parameter_or_none(system: System, name: str) -> NamedParameter | None:
 
 def _record_name_of_leaves(names_by_leaf: dict[int, str], name: str, parameter: NamedParameter) -> None:
     """Record the name under which the user gave a parameter; raise InputError if another name gave it before."""
-    for i in parameter.leaves:
+    for i in parameter.leaf_indices:
         if i in names_by_leaf:
             raise InputError(f"{name} and {names_by_leaf[i]} are the same parameter. Give one of them")
         names_by_leaf[i] = name
@@ -245,7 +245,9 @@ def _parameters_by_name_and_by_path(system: System) -> tuple[dict[str, NamedPara
             parameters_by_name[name] = NamedParameter(value, tuple(leaves))
         else:  # different parameters, whose paths differ in the fields of wrappers only
             parameters_by_name |= {paths[i]: NamedParameter(arrays[i], (i,)) for i in leaves}
-    parameters_by_path = {paths[i]: parameter for parameter in parameters_by_name.values() for i in parameter.leaves}
+    parameters_by_path = {
+        paths[i]: parameter for parameter in parameters_by_name.values() for i in parameter.leaf_indices
+    }
     return _replace_energy_matrix_by_inertia(system, parameters_by_name, parameters_by_path), parameters_by_path
 
 
@@ -285,5 +287,5 @@ def _replace_energy_matrix_by_inertia(
         return parameters_by_name
     parameters_by_path["energy.A"] = matrix
     inverse = 1.0 / matrix.value if matrix.value.ndim == 1 else np.linalg.inv(matrix.value)
-    inertia = NamedParameter(inverse, matrix.leaves, is_inverse=True)
+    inertia = NamedParameter(inverse, matrix.leaf_indices, is_inverse=True)
     return {"energy.inertia": inertia, **{name: p for name, p in parameters_by_name.items() if name != "energy.A"}}

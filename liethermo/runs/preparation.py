@@ -39,12 +39,14 @@ from .system_family import Family
 
 Result = TypeVar("Result")
 
-REFERENCE_STEPS = (
+REFERENCE_OPTIONS_MESSAGE = (
     "Reference chooses its own steps and cannot be combined with Adaptive, save_at, until or dense. Use another method"
 )
 """Error message for options that need steps of the library's own methods."""
 
-NOISY_STEPS = "noise= needs fixed steps and cannot be combined with Adaptive, until or dense. Give the step as a number"
+NOISE_OPTIONS_MESSAGE = (
+    "noise= needs fixed steps and cannot be combined with Adaptive, until or dense. Give the step as a number"
+)
 """Error message for options that a run with noise does not have."""
 
 
@@ -66,10 +68,10 @@ def refuse_tracers(function: Callable[..., Result]) -> Callable[..., Result]:
     return call
 
 
-def check_choice(name: str, value, choices: tuple[str, ...]) -> None:
+def check_choice(argument_name: str, value, choices: tuple[str, ...]) -> None:
     if value not in choices:
         *leading_choices, last_choice = map(repr, choices)
-        raise InputError(f"{name} must be {', '.join(leading_choices)} or {last_choice}, got {value!r}")
+        raise InputError(f"{argument_name} must be {', '.join(leading_choices)} or {last_choice}, got {value!r}")
 
 
 def checked_or_default_method(method, noise: Fluctuations | None = None, *, is_single_trajectory: bool = False) -> Any:
@@ -95,9 +97,9 @@ def refuse_incompatible_options(
     """Raise InputError if Reference or noise is combined with adaptive steps, events, dense output or ``save_at``."""
     is_examined = isinstance(step, Adaptive) or until is not None or dense
     if isinstance(method, Reference) and (is_examined or save_at is not None):
-        raise InputError(REFERENCE_STEPS)
+        raise InputError(REFERENCE_OPTIONS_MESSAGE)
     if noise is not None and is_examined:
-        raise InputError(NOISY_STEPS)
+        raise InputError(NOISE_OPTIONS_MESSAGE)
 
 
 def resolve_invariants(system: System, x0) -> System:

@@ -60,7 +60,7 @@ MAX_CACHED_SCHEDULES = 32
 MAX_CACHED_SCHEDULE_STEPS = 10_000
 """Largest number of steps of a schedule that is cached."""
 
-_schedules: LRUCache[StepSchedule] = LRUCache(MAX_CACHED_SCHEDULES)
+_cached_schedules: LRUCache[StepSchedule] = LRUCache(MAX_CACHED_SCHEDULES)
 
 
 class Propagator(metaclass=ListedType):
@@ -304,11 +304,11 @@ class Propagator(metaclass=ListedType):
         if not is_plain or kind not in (float, int, Adaptive):
             return make_schedule(t_span, self.step, save_every, save_at, allow_infinite_end, breaks, declared_times)
         key = *checked_span(t_span), save_every, kind if kind is Adaptive else self.step
-        schedule = _schedules.get(key)
+        schedule = _cached_schedules.get(key)
         if schedule is None:
             schedule = make_schedule(key[:2], self.step, save_every)
             if schedule.n_steps <= MAX_CACHED_SCHEDULE_STEPS:
-                _schedules.get_or_compute(key, lambda: schedule)
+                _cached_schedules.get_or_compute(key, lambda: schedule)
         return schedule
 
     def _compiled_final_state_function(
@@ -378,7 +378,7 @@ class Propagator(metaclass=ListedType):
         if function is None:
             function = (
                 self.with_parameters(parameters)._compiled_final_state_function(t_span, varied_parameters)
-                or _final_state_left_to_run
+                or _defer_final_state_to_run
             )
             thread.add((names, key, t_span), function)
         return function(x0)
@@ -406,8 +406,8 @@ class Propagator(metaclass=ListedType):
         return problem if problem.system.inner is None else None
 
 
-def _final_state_left_to_run(x0) -> None:
-    """Return None in place of a last state, so that the caller starts a run: there is no machine code."""
+def _defer_final_state_to_run(x0) -> None:
+    """Return None in place of a last state, so that the caller computes it by a run, because no program does."""
 
 
 class _ThreadFinalStateFunctions(threading.local):

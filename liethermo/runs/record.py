@@ -63,7 +63,7 @@ class TrajectoryGroup(NamedTuple):
 
     Attributes
     ----------
-    numbers : array of int, shape (B,)
+    trajectory_numbers : array of int, shape (B,)
         Numbers of the trajectories in the ensemble, increasing.
     problem : Problem
         The problem of one trajectory, whose method and laws belong to all.
@@ -83,7 +83,7 @@ class TrajectoryGroup(NamedTuple):
     noise : NoisePaths or None
     """
 
-    numbers: np.ndarray
+    trajectory_numbers: np.ndarray
     problem: Problem
     family: Family
     member: System
@@ -137,7 +137,7 @@ class EnsembleRecord:
         if len(self.x0) < n_trajectories:
             self.x0 = np.full((n_trajectories, dim), np.nan)
             for group in groups:
-                self.x0[group.numbers] = group.x0
+                self.x0[group.trajectory_numbers] = group.x0
         self.failure_reasons: dict[int, str] = {}
         self.events: list[EventOccurrence] = []
         self.groups = [GroupRecord(self, group) for group in groups]
@@ -176,9 +176,12 @@ class EnsembleRecord:
             if self.trajectories is not None:
                 work = np.asarray(self.clock.work(x))
             x, x0, energy = None if x is None else x[..., :-2], x0[..., :-2], energy + work
-        events, sources = self.groups[0].group.events, [part.evidence_source() for part in self.groups]
-        engine = " and ".join(sorted({part.engine for part in self.groups} - {""}))
-        result = Ensemble(
+        events, sources = (
+            self.groups[0].group.events,
+            [group_record.make_evidence_source() for group_record in self.groups],
+        )
+        engine = " and ".join(sorted({group_record.engine for group_record in self.groups} - {""}))
+        ensemble = Ensemble(
             t=t,
             x=x,
             energy=energy,
@@ -191,7 +194,7 @@ class EnsembleRecord:
             attitude=attitude,
             attitude0=attitude0,
             work=work,
-            laws=common_laws([part.group.problem.laws for part in self.groups]),
+            laws=common_laws([group_record.group.problem.laws for group_record in self.groups]),
             engine=engine,
             events=Events() if events is None else collect_events(self.member, events.names, self.events),
             reasons={**inadmissible_reasons, **self.failure_reasons},
@@ -202,7 +205,7 @@ class EnsembleRecord:
             **quantities,
             **other_fields,
         )
-        return reshape_to_sites(self.member, result)
+        return reshape_to_sites(self.member, ensemble)
 
     def _velocity_getters_by_name(self) -> dict[str, Callable[[], np.ndarray]]:
         """Return functions that compute the velocities of all trajectories, by the names of the velocities."""
@@ -213,17 +216,23 @@ class EnsembleRecord:
         }
 
     def _compute_velocities(self, velocity_name: str) -> np.ndarray:
-        velocities, numbers = zip(
-            *((part.velocities(velocity_name), part.numbers) for part in self.groups), strict=True
+        velocities, trajectory_numbers = zip(
+            *(
+                (group_record.compute_velocities(velocity_name), group_record.trajectory_numbers)
+                for group_record in self.groups
+            ),
+            strict=True,
         )
         values = np.full((len(self.status), *velocities[0].shape[1:]), np.nan)
-        values[np.concatenate(numbers)] = np.concatenate(velocities)
+        values[np.concatenate(trajectory_numbers)] = np.concatenate(velocities)
         return values
 
     def _build_solution(self, ensemble: Ensemble, i: int) -> Solution:
         """Return the solution of trajectory i of the ensemble with the fields that a single run would have."""
-        part = next(part for part in self.groups if i in part.numbers)
-        return part.build_solution(ensemble.member_solution(i), int(np.searchsorted(part.numbers, i)))
+        group_record = next(group_record for group_record in self.groups if i in group_record.trajectory_numbers)
+        return group_record.complete_member_solution(
+            ensemble.member_solution(i), int(np.searchsorted(group_record.trajectory_numbers, i))
+        )
 
 
 class GroupRecord:
@@ -243,8 +252,8 @@ class GroupRecord:
     """
 
     def __init__(self, record: EnsembleRecord, group: TrajectoryGroup):
-        self.record, self.group, self.numbers, self.engine = record, group, group.numbers, ""
-        self._is_all = len(self.numbers) == len(record.status)
+        self.record, self.group, self.trajectory_numbers, self.engine = record, group, group.trajectory_numbers, ""
+        self._is_all = len(self.trajectory_numbers) == len(record.status)
         rows = self._record_rows(slice(None))
         record.status[rows] = StatusCode.INTERRUPTED
         record.quantities["first_step"][rows] = group.schedule.longest_step_after_each_save[0]
@@ -252,7 +261,7 @@ class GroupRecord:
 
     def _record_rows(self, members: MemberSelection) -> MemberSelection:
         """Return the rows of the record for the trajectories with these indices in the group."""
-        return members if self._is_all else self.numbers[members]
+        return members if self._is_all else self.trajectory_numbers[members]
 
     @property
     def is_interrupted(self) -> bool:
@@ -292,7 +301,7 @@ class GroupRecord:
         for event in occurrences:
             member = int(members[event.trajectory])
             if event.trajectory == 0 or members[event.trajectory - 1] != member:  # no copy that fills a padded batch
-                self.record.events.append(event._replace(trajectory=int(self.numbers[member])))
+                self.record.events.append(event._replace(trajectory=int(self.trajectory_numbers[member])))
 
     def record_outcome_of_fixed_steps(
         self, members: MemberSelection, initial_fields: Mapping[str, np.ndarray], final_fields: Mapping[str, np.ndarray]
@@ -383,17 +392,17 @@ class GroupRecord:
             if text := ensemble_blow_up_message_or_empty(
                 final_states[i], group.x0[j], velocity, t - group.schedule.start, t, group.h
             ):
-                self.record.failure_reasons[int(self.numbers[j])] = text
+                self.record.failure_reasons[int(self.trajectory_numbers[j])] = text
 
-    def evidence_source(self) -> GroupEvidenceSource:
+    def make_evidence_source(self) -> GroupEvidenceSource:
         """Return the function that computes the evidence for an audit from a sample of the trajectories.
 
         Half of the sample took most iterations, half is evenly spaced.
         """
         record, group = self.record, self.group
-        n_steps = record.steps[self.numbers]
+        n_steps = record.steps[self.trajectory_numbers]
         sample_indices = indices_of_largest_and_evenly_spaced(
-            record.iterations[self.numbers] / np.fmax(n_steps, 1), MAX_LOCAL_ERROR_STEPS
+            record.iterations[self.trajectory_numbers] / np.fmax(n_steps, 1), MAX_LOCAL_ERROR_STEPS
         )
         n_equal_steps = 1 if np.isnan(group.h) else group.schedule.segments[0].n_full_steps
         return GroupEvidenceSource(
@@ -414,7 +423,7 @@ class GroupRecord:
 
         Both are empty if the run saves no states.
         """
-        record, rows = self.record, self.numbers[sample_indices]
+        record, rows = self.record, self.trajectory_numbers[sample_indices]
         if record.trajectories is not None:
             times = evenly_spaced_indices(record.trajectories.shape[1], MAX_SENSITIVITY_STATES)
             return record.trajectories[rows][:, times, :-2], record.saved_times[times]
@@ -424,7 +433,7 @@ class GroupRecord:
         end = np.nanmax(record.quantities["end_time"])
         return states, np.linspace(record.start, end, MAX_SENSITIVITY_STATES)
 
-    def velocities(self, velocity_name: str) -> np.ndarray:
+    def compute_velocities(self, velocity_name: str) -> np.ndarray:
         """Return velocities, shape (members, ..., k), at the recorded states of the group."""
         rows, x, trajectories = self._record_rows(slice(None)), self.record.x, self.record.trajectories
         if trajectories is None:
@@ -437,7 +446,7 @@ class GroupRecord:
             return velocities_at_states(velocity_name, self.group.member, states)
         return np.stack([velocities_at_states(velocity_name, family.member(i), x) for i, x in enumerate(states)])
 
-    def build_solution(self, member_solution: Solution, member_index: int) -> Solution:
+    def complete_member_solution(self, member_solution: Solution, member_index: int) -> Solution:
         """Return the solution of a member with the conserved functions and laws that a single run would have.
 
         ``member_solution`` holds what the ensemble knows of it: states, energy, entropy, status and statistics.
@@ -445,7 +454,7 @@ class GroupRecord:
         method, system, row, record = (
             self.group.method,
             self.group.family.member(member_index),
-            int(self.numbers[member_index]),
+            int(self.trajectory_numbers[member_index]),
             self.record,
         )
         if record.trajectories is None:
@@ -479,12 +488,12 @@ class GroupRecord:
 def common_laws(laws_of_groups: Sequence[Laws]) -> Laws:
     """Return the laws that hold for all groups: the functions that every group conserves, or does not promise."""
     first_laws = laws_of_groups[0]
-    conserved_in_all = set.intersection(*(set(laws.conserved) for laws in laws_of_groups))
-    constants = set.intersection(*({*laws.conserved, *laws.unpromised} for laws in laws_of_groups))
-    names = [name for name in (*first_laws.conserved, *first_laws.unpromised) if name in constants]
+    commonly_conserved_names = set.intersection(*(set(laws.conserved) for laws in laws_of_groups))
+    common_constant_names = set.intersection(*({*laws.conserved, *laws.unpromised} for laws in laws_of_groups))
+    names = [name for name in (*first_laws.conserved, *first_laws.unpromised) if name in common_constant_names]
     return replace(
         first_laws,
-        conserved=tuple(name for name in names if name in conserved_in_all),
-        unpromised=tuple(name for name in names if name not in conserved_in_all),
+        conserved=tuple(name for name in names if name in commonly_conserved_names),
+        unpromised=tuple(name for name in names if name not in commonly_conserved_names),
         unknown=tuple(dict.fromkeys(name for laws in laws_of_groups for name in laws.unknown)),
     )

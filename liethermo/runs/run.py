@@ -80,8 +80,8 @@ class Run:
         if problem.noise is not None and (n_increments := noise_dimension(self.method)):
             noise_paths = NoisePaths(problem.noise, n_increments, np.zeros(1, dtype=int), schedule)
 
-            def noise_increments(first_step: int, steps: int, h: float) -> np.ndarray:
-                return noise_paths.step_increments(slice(None), first_step, steps, h)[0]
+            def noise_increments(first_step: int, n_steps: int, h: float) -> np.ndarray:
+                return noise_paths.step_increments(slice(None), first_step, n_steps, h)[0]
 
         self.engine = problem.engine(engine, self.system, schedule.n_steps, noise_increments)
 
@@ -103,8 +103,10 @@ class Run:
             trajectory = self.engine.start(self.saved_states[0][0])
             self.saved_energies_entropies = [np.array([[trajectory.read("energy"), trajectory.read("entropy")]])]
 
-            def record_call(call: EngineCall, first_step: int, saved_states: SavedStates) -> bool:
-                self._save_states_of_call(saved_states, first_step, call.steps_per_save, call.keep)
+            def record_call(engine_call: EngineCall, first_step: int, saved_states: SavedStates) -> bool:
+                self._save_states_of_call(
+                    saved_states, first_step, engine_call.steps_per_save, engine_call.are_states_saved
+                )
                 progress_bar.update(self.schedule.time_after(int(trajectory.read("step"))))
                 if trajectory.read("status") != StatusCode.COMPLETED:
                     return False
@@ -151,7 +153,7 @@ class Run:
             self.engine = self.problem.engine("array", self.system, 0)  # machine code does not call Python
         self.step, unsaved_steps = step, None
 
-        def save_accepted_steps(accepted_steps: AcceptedSteps):
+        def handle_accepted_steps(accepted_steps: AcceptedSteps):
             nonlocal unsaved_steps
             ends = accepted_steps.t[1:]
             is_saved = np.isin(ends, saved_stop_times)
@@ -179,7 +181,7 @@ class Run:
         self.saved_energies_entropies = [np.array([[float(state.energy), float(state.entropy)]])]
         values_per_step = self.system.dim * ((0 if saves_at_stops else 1) / save_every + (self.all_states is not None))
         max_steps = MAX_STORED_VALUES / max(values_per_step, 1e-9)
-        outcome = AdaptiveRun(self.engine, adaptive_runs, control, stop_times, save_accepted_steps, max_steps, events)
+        outcome = AdaptiveRun(self.engine, adaptive_runs, control, stop_times, handle_accepted_steps, max_steps, events)
         outcome.advance_to_end()
         if unsaved_steps is not None:
             self._save_accepted_steps(unsaved_steps, slice(-1, None))
@@ -210,7 +212,9 @@ class Run:
             np.column_stack([accepted_steps.energy, accepted_steps.entropy])[selection],
         )
 
-    def _save_states_of_call(self, saved_states: SavedStates, first_step: int, steps_per_save: int, keep: bool) -> None:
+    def _save_states_of_call(
+        self, saved_states: SavedStates, first_step: int, steps_per_save: int, are_states_saved: bool
+    ) -> None:
         if self.all_states is not None:
             step_counts = first_step + steps_per_save * np.arange(1, len(saved_states.x) + 1)
             times = self.schedule.times_after(step_counts)
@@ -219,7 +223,7 @@ class Run:
             self._append_saved_states(
                 times[is_saved], saved_states.x[is_saved], saved_states.energy_and_entropy[is_saved]
             )
-        elif keep:
+        elif are_states_saved:
             times = self.schedule.saved_times[self.n_saved : self.n_saved + len(saved_states.x)]
             self._append_saved_states(times, saved_states.x, saved_states.energy_and_entropy)
 

@@ -71,14 +71,14 @@ class EngineCall(NamedTuple):
 
     Attributes
     ----------
-    keep : bool
+    are_states_saved : bool
         False if the states of this call are not among the saved states of the run.
     """
 
     h: float
     n_saves: int
     steps_per_save: int
-    keep: bool
+    are_states_saved: bool
 
 
 class StepSchedule:
@@ -172,8 +172,8 @@ class StepSchedule:
         if not breaks:
             return self
         save_at = self.saved_stop_times if self.save_every is None else None
-        all_breaks = sorted({*self.all_breaks, *breaks})
-        return StepSchedule((self.start, self.end), self.h, self.save_every, save_at, breaks=all_breaks)
+        break_times = sorted({*self.all_breaks, *breaks})
+        return StepSchedule((self.start, self.end), self.h, self.save_every, save_at, breaks=break_times)
 
     def has_step_end_at(self, t: float) -> bool:
         """Return whether a time inside the span is a whole number of steps after its start, to rounding."""
@@ -203,8 +203,8 @@ class StepSchedule:
                 )
                 n_done += n_saves * steps_per_save
                 is_end = n_done >= segment.n_steps
-                keep = save_every is not None or (is_end and segment.saves_end)
-                yield EngineCall(self.h, n_saves, steps_per_save, keep)
+                are_states_saved = save_every is not None or (is_end and segment.saves_end)
+                yield EngineCall(self.h, n_saves, steps_per_save, are_states_saved)
             if segment.last_step_size:
                 yield EngineCall(segment.last_step_size, 1, 1, segment.saves_end)
 
@@ -326,8 +326,8 @@ def make_schedule(
     if not isinstance(step, Adaptive) and (save_every not in (None, 1) or len(kinks) * step_size > end - start):
         kinks = []
     kinks = kinks if len(kinks) <= MAX_KINKS else []
-    all_breaks = {*(checked_breaks(breaks) if np.size(breaks) else ()), *declared_times.jumps, *kinks}
-    breaks_in_span = tuple(sorted(t for t in all_breaks if start <= t <= end))
+    break_times = {*(checked_breaks(breaks) if np.size(breaks) else ()), *declared_times.jumps, *kinks}
+    breaks_in_span = tuple(sorted(t for t in break_times if start <= t <= end))
     schedule = StepSchedule(
         (start, end), step_size, save_every, allow_infinite_end=allow_infinite_end, breaks=breaks_in_span
     )

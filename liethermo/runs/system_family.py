@@ -37,7 +37,7 @@ class Family:
 
     Attributes
     ----------
-    form : ProgramStructure
+    program_structure : ProgramStructure
         Builds a member from its parameters, a list of arrays.
     parameter_arrays : list of ndarray
         The parameters of all members along the first axis, which has length 1 if all members share them.
@@ -55,7 +55,7 @@ class Family:
         row. A selection of one member keeps these flags, so the same program runs it.
     """
 
-    form: ProgramStructure
+    program_structure: ProgramStructure
     parameter_arrays: list[np.ndarray]
     common_system: System | None = None
     example: System | None = None
@@ -139,12 +139,13 @@ class Family:
 
         def arrays_of_built_system(*arrays):
             nonlocal static_part
-            arrays, static_part = eqx.partition(self.form.rebuild(list(arrays)), eqx.is_array)
+            arrays, static_part = eqx.partition(self.program_structure.rebuild(list(arrays)), eqx.is_array)
             return arrays
 
         try:
             program = trace_function(
-                arrays_of_built_system, *(jax.ShapeDtypeStruct(shape, np.float64) for shape in self.form.shapes)
+                arrays_of_built_system,
+                *(jax.ShapeDtypeStruct(shape, np.float64) for shape in self.program_structure.shapes),
             )
         except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
             raise InputError(
@@ -167,7 +168,7 @@ class Family:
         form = ProgramStructure(
             (program.program, fingerprint(static_part)), tuple(value.shape[1:] for value in values), rebuild
         )
-        return replace(self, form=form, parameter_arrays=values)
+        return replace(self, program_structure=form, parameter_arrays=values)
 
     def with_builder_arrays(self, builder_arrays: list[np.ndarray]) -> Family:
         """Return the family with these arrays as the arguments of the function that builds its members."""
@@ -177,32 +178,34 @@ class Family:
             has_member_axis=(),
         )
 
-    def map_members(self, change: Callable[..., System], *arguments: Hashable) -> Family:
-        """Return the family whose members are ``change(member, *arguments)``; the function must be hashable."""
-        form = self.form
-        key = form.key, change, arguments
-        form_of_changed = ProgramStructure(key, form.shapes, lambda arrays: change(form.rebuild(arrays), *arguments))
+    def map_members(self, change_member: Callable[..., System], *arguments: Hashable) -> Family:
+        """Return the family whose members are ``change_member(member, *arguments)``; the function must be hashable."""
+        form = self.program_structure
+        key = form.key, change_member, arguments
+        form_of_changed = ProgramStructure(
+            key, form.shapes, lambda arrays: change_member(form.rebuild(arrays), *arguments)
+        )
         return Family(form_of_changed, self.parameter_arrays, has_member_axis=self.has_member_axis)
 
-    def annotate_members(self, annotate: Callable[..., System], *arguments: Hashable) -> Family:
-        """Return the family whose members are ``annotate(member, *arguments)``; a common system remains common."""
+    def annotate_members(self, annotate_member: Callable[..., System], *arguments: Hashable) -> Family:
+        """Return the family of the systems ``annotate_member(member, *arguments)``; a common system remains common."""
         if self.common_system is not None:
-            return Family.from_arguments(annotate(self.common_system, *arguments), None)
-        return self.map_members(annotate, *arguments)
+            return Family.from_arguments(annotate_member(self.common_system, *arguments), None)
+        return self.map_members(annotate_member, *arguments)
 
-    def map_members_with_shared_numbers(self, change: Callable[..., System], *numbers: float) -> Family:
-        """Return the family whose members are ``change(member, *numbers)``; the function must be hashable.
+    def map_members_with_shared_numbers(self, change_member: Callable[..., System], *numbers: float) -> Family:
+        """Return the family whose members are ``change_member(member, *numbers)``; the function must be hashable.
 
         The numbers become parameters, so families with other numbers share the compiled program.
         """
-        form, count = self.form, len(numbers)
+        form, count = self.program_structure, len(numbers)
 
         def rebuild(arrays):
-            return change(form.rebuild(arrays[:-count]), *arrays[-count:])
+            return change_member(form.rebuild(arrays[:-count]), *arrays[-count:])
 
         values = [*self.parameter_arrays, *(np.array([number]) for number in numbers)]
         return Family(
-            ProgramStructure((form.key, change, count), (*form.shapes, *[()] * count), rebuild),
+            ProgramStructure((form.key, change_member, count), (*form.shapes, *[()] * count), rebuild),
             values,
             has_member_axis=self.has_member_axis,
         )
@@ -223,7 +226,11 @@ class Family:
         return list(zip(self.parameter_arrays, self.has_member_axis, strict=True))
 
     def member(self, member_index: int) -> System:
-        return self.form.rebuild(self.member_arrays(member_index)) if self.common_system is None else self.common_system
+        return (
+            self.program_structure.rebuild(self.member_arrays(member_index))
+            if self.common_system is None
+            else self.common_system
+        )
 
     @property
     def representative(self) -> System:
@@ -233,7 +240,9 @@ class Family:
     def member_with_unknown_parameters(self) -> System:
         """Return a system with the parameters that all members share, and NaN for those that differ."""
         arrays = zip(self.parameter_arrays, self.has_member_axis, strict=True)
-        return self.form.rebuild([np.full(a.shape[1:], np.nan) if differ else a[0] for a, differ in arrays])
+        return self.program_structure.rebuild(
+            [np.full(a.shape[1:], np.nan) if differ else a[0] for a, differ in arrays]
+        )
 
     def members_with_extreme_parameters(self) -> list[int]:
         """Return the indices of members with the smallest and largest parameters, the likeliest to be out of range."""
@@ -301,9 +310,9 @@ class Family:
             is_nan |= np.isnan(value.reshape(len(value), -1)).any(axis=1)
         return {int(i): "one of its parameters is NaN" for i in np.flatnonzero(is_nan)}
 
-    def select(self, members: np.ndarray) -> Family:
-        """Return the family of the selected members."""
-        values = [value[members] if has_axis else value for value, has_axis in self._arrays_with_axis_flags]
+    def select(self, member_indices: np.ndarray) -> Family:
+        """Return the family of the members with these indices."""
+        values = [value[member_indices] if has_axis else value for value, has_axis in self._arrays_with_axis_flags]
         return replace(self, parameter_arrays=values, refusal_reasons={})
 
     # -- parameters in the form of the engines ----------------------------------------------------------------------
@@ -335,7 +344,7 @@ class Family:
         parameters = self.parameter_matrix(members, len(states))
         rows = np.concatenate([parameters, states], axis=1)
         return evaluate_at_points(
-            _function_of_parameter_and_state_row(function), (self.form, parameters.shape[1]), rows
+            _function_of_parameter_and_state_row(function), (self.program_structure, parameters.shape[1]), rows
         )
 
     def vmap_arguments(self, members: slice | np.ndarray) -> tuple[list[jax.Array], list[Any]]:
@@ -375,7 +384,7 @@ def _function_of_parameter_and_state_row(function: Callable) -> Callable:
     """
 
     def evaluate_row(model: tuple[ProgramStructure, int], row):
-        form, p = model
-        return function(form.build(row[:p]), row[p:])
+        structure, n_parameters = model
+        return function(structure.build(row[:n_parameters]), row[n_parameters:])
 
     return evaluate_row

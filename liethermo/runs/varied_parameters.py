@@ -55,7 +55,7 @@ class VariedParameters:
         Not driven, without preserved functions of its dissipation.
     method : OneStepMethod
         The method of the user.
-    names : sequence of str
+    parameter_names : sequence of str
 
     Attributes
     ----------
@@ -70,20 +70,23 @@ class VariedParameters:
         If the test of conservation cannot be compiled.
     """
 
-    def __init__(self, system: System, method: Any, names: Sequence[str]):
+    def __init__(self, system: System, method: Any, parameter_names: Sequence[str]):
         self._method, self._structure = method, ProgramStructure.from_module(system)
-        self._leaves, parameters = parameter_arrays(system), [require_parameter(system, name) for name in names]
-        self._varied_leaves = [i for parameter in parameters for i in parameter.leaves]
+        self._leaves, parameters = (
+            parameter_arrays(system),
+            [require_parameter(system, name) for name in parameter_names],
+        )
+        self._varied_leaves = [i for parameter in parameters for i in parameter.leaf_indices]
         ends = np.cumsum([leaf.size for leaf in self._leaves])
         self.indices = np.concatenate([np.arange(ends[i] - self._leaves[i].size, ends[i]) for i in self._varied_leaves])
         self.entries = np.concatenate([self._leaves[i].ravel() for i in self._varied_leaves])
         slots = iter(self._split_by_leaf(self.entries))
-        self._slots = [(parameter, [next(slots) for _ in parameter.leaves]) for parameter in parameters]
+        self._slots = [(parameter, [next(slots) for _ in parameter.leaf_indices]) for parameter in parameters]
         conditions = parameter_conditions_by_leaf(system)
         self._conditions = [
             (conditions[i].test, slot)
             for parameter, slots_of_leaves in self._slots
-            for i, slot in zip(parameter.leaves, slots_of_leaves, strict=True)
+            for i, slot in zip(parameter.leaf_indices, slots_of_leaves, strict=True)
             if i in conditions
         ]
         self._functions = tuple(

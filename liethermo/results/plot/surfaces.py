@@ -238,19 +238,22 @@ class _LevelSurface:
         """Return the points where rays along unit vectors, shape (..., 3), meet the surface; NaN for other rays."""
         has_crossing = self._ray_crossings(directions)
         first_interval = has_crossing.argmax(axis=0)
-        inner, outer = self.radii[first_interval], self.radii[first_interval + 1]
-        inner_side = self._is_above_level(inner[..., None] * directions)
+        inner_radius, outer_radius = self.radii[first_interval], self.radii[first_interval + 1]
+        inner_side = self._is_above_level(inner_radius[..., None] * directions)
         for _ in range(40):
-            midpoint = (inner + outer) / 2
+            midpoint = (inner_radius + outer_radius) / 2
             is_on_inner_side = self._is_above_level(midpoint[..., None] * directions) == inner_side
-            inner, outer = np.where(is_on_inner_side, midpoint, inner), np.where(is_on_inner_side, outer, midpoint)
-        is_hit = has_crossing.any(axis=0) & (self.is_closed | (outer <= 1.5 * self.extent))
-        return np.where(is_hit[..., None], outer[..., None] * directions, np.nan)
+            inner_radius, outer_radius = (
+                np.where(is_on_inner_side, midpoint, inner_radius),
+                np.where(is_on_inner_side, outer_radius, midpoint),
+            )
+        is_hit = has_crossing.any(axis=0) & (self.is_closed | (outer_radius <= 1.5 * self.extent))
+        return np.where(is_hit[..., None], outer_radius[..., None] * directions, np.nan)
 
-    def hides(self, points: np.ndarray, view: np.ndarray) -> np.ndarray:
-        """Return whether the surface hides points, shape (..., 3), from a distant eye in the direction ``view``."""
+    def hides(self, points: np.ndarray, view_direction: np.ndarray) -> np.ndarray:
+        """Return whether the surface hides points, shape (..., 3), from a distant viewer in a direction."""
         depths = np.geomspace(0.01, 20.0, 80) * self.extent
-        side = self._is_above_level(points + depths.reshape(-1, *[1] * points.ndim) * view)
+        side = self._is_above_level(points + depths.reshape(-1, *[1] * points.ndim) * view_direction)
         return (side[1:] != side[:-1]).any(axis=0)
 
     def _is_above_level(self, points: np.ndarray) -> np.ndarray:
@@ -288,11 +291,11 @@ class _Scene:
         for line in _level_curves(self.mesh, normals @ self.view_direction, 0.0):
             self._draw_line(line, color=GREY, linewidth=0.8)
 
-    def draw_contours(self, function: PointFunction, count: int) -> None:
+    def draw_contours(self, function: PointFunction, n_contours: int) -> None:
         """Draw curves on the solid along which the function is constant."""
         if self.solid is not None:
             values = function(self.mesh)
-            for level in np.linspace(values.min(), values.max(), count + 2)[1:-1]:
+            for level in np.linspace(values.min(), values.max(), n_contours + 2)[1:-1]:
                 self._draw_contour(values, level, color=GREY, linewidth=0.4)
 
     def draw_level_surface(self, function: PointFunction, index: int, color: str, label: str) -> None:
