@@ -400,7 +400,7 @@ class Ensemble(AuditableResult):
         KeyError, TypeError or ValueError if a part is missing or does not fit.
         """
         if len(series["time"]) != int(attributes["times"]):
-            raise ValueError(f"{len(series['time'])} times of {attributes['times']}")
+            raise ValueError(f"it has {len(series['time'])} times, and {attributes['times']} were written")
         n_trajectories, n_times = len(series["x0"]), len(numeric_array_of_shape(series, "time", (None,)))
         per_member = {name: numeric_array_of_shape(series, name, (n_trajectories,)) for name in PER_MEMBER_FIELDS}
         time_series = {

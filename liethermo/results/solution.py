@@ -376,7 +376,7 @@ class Solution(AuditableResult):
         json_data = {name: json.loads(attributes[name]) for name in ("status", "stats", "laws", "provenance")}
         t, x = numeric_array_of_shape(series, "time", (None,)), series["x"]
         if len(t) != int(attributes["times"]):
-            raise ValueError(f"{len(t)} times of {attributes['times']}")
+            raise ValueError(f"it has {len(t)} times, and {attributes['times']} were written")
         names = [str(name) for name in series["invariant_name"]]
         entropy = numeric_array_of_shape(series, "entropy", (len(t),)) if "entropy" in series else None
         attitude = None

@@ -80,7 +80,7 @@ def checked_save_times(save_at, schedule: StepSchedule) -> jax.Array | np.ndarra
     if isinstance(times, jax.Array):
         return times
     if not np.isfinite(times).all():
-        raise InputError("save_at must be a list of finite times")
+        raise InputError(f"save_at must be a list of finite times, got {save_at!r:.60}")
     return clip_times_to_span(times, schedule.start, schedule.end, "save_at")
 
 

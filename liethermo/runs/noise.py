@@ -201,7 +201,9 @@ class Fluctuations(metaclass=ListedType):
         residuals = evaluate_at_points(_noise_and_measure_residuals, (system, density), points)
         is_finite = np.isfinite(residuals[MEASURE_ROW])
         if not is_finite.any():
-            raise InputError(f"energy or dissipation is not finite at any of the {len(points)} test points")
+            raise InputError(
+                f"energy or dissipation is not finite at any of the {len(points)} test points. Give another scale="
+            )
         rows = []
         for name, values in residuals.items():
             max_residual = float(values[is_finite].max())

@@ -201,7 +201,7 @@ class Propagator(metaclass=ListedType):
             try:
                 solution.save(save_to)
             except FileError as error:
-                raise FileError(f"{error}. It is the exception's .solution", solution) from error
+                raise FileError(f"{error}. The exception has this result as .solution", solution) from error
         if on_failure == "raise":
             raise_if_failed(solution)
         return solution

@@ -143,7 +143,7 @@ def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> M
         except LiethermoError as error:
             refusals.append(f"{method}: {error}")
     if not trials:
-        raise InputError("; ".join(refusals))
+        raise InputError("no method takes steps of this accuracy from this x0: " + "; ".join(refusals))
     trials.sort(key=lambda trial: trial.evaluations)
     cheapest, explicit_trials = trials[0], [trial for trial in trials if trial.method.explicit]
     if cheapest.method.explicit:

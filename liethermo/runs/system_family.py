@@ -360,10 +360,11 @@ def broadcast_size(*sizes: int) -> int:
     distinct_sizes = {size for size in sizes if size != 1}
     if len(distinct_sizes) > 1:
         raise InputError(
-            f"initial states and parameters are for different numbers of trajectories: {sorted(distinct_sizes)}"
+            f"initial states, attitudes and parameters are for {' and '.join(map(str, sorted(distinct_sizes)))} "
+            "trajectories. Give one of each for all trajectories, or equal numbers"
         )
     if 0 in distinct_sizes:
-        raise InputError("an ensemble has at least one trajectory")
+        raise InputError("an ensemble needs at least one trajectory, got 0 initial states or sets of parameters")
     return distinct_sizes.pop() if distinct_sizes else 1
 
 

@@ -193,7 +193,7 @@ def projection(
     """
     path = checked_figure_path(path)
     if len(coordinates) not in (2, 3):
-        raise InputError(f"coordinates must be 2 or 3, got {len(coordinates)}")
+        raise InputError(f"coordinates must have 2 or 3 entries, got {len(coordinates)}")
     algebra = None if system is None else system.lie_algebra
     names = None if algebra is None else algebra.basis_names
     labels, functions = zip(*(_coordinate_label_and_function(c, solution, names) for c in coordinates), strict=True)
@@ -267,10 +267,12 @@ def _coordinate_label_and_function(
         return label, lambda x: np.asarray(jax.vmap(coordinate)(jnp.asarray(x)))
     if isinstance(coordinate, str):
         if basis_names is None or coordinate not in basis_names:
-            raise InputError(
-                f"{coordinate!r} is not the name of a basis element: they are "
-                f"{', '.join(basis_names) if basis_names else 'not known'}"
+            cure = (
+                f"The names are {', '.join(basis_names)}"
+                if basis_names
+                else "Names need system=, a system on a Lie algebra whose basis has names"
             )
+            raise InputError(f"{coordinate!r} is not the name of a basis element. {cure}")
         coordinate = basis_names.index(coordinate)
     n = solution.x.shape[1]
     if isinstance(coordinate, bool) or not isinstance(coordinate, int | np.integer) or not 0 <= coordinate < n:

@@ -422,7 +422,7 @@ def sphere_field(
     if field.ndim != 2 or min(field.shape) < 2 or field.dtype.kind not in "fiu":
         raise InputError(f"values must be real numbers of shape (latitudes, longitudes), got shape {np.shape(values)}")
     if not np.isfinite(field).all():
-        raise InputError("values must be finite")
+        raise InputError("values must be finite, got NaN or infinity")
     if ax is None:
         ax = plt.figure(figsize=(6.4, 3.4), dpi=DPI, layout="constrained").add_subplot(projection="mollweide")
     elif getattr(ax, "name", "") != "mollweide":
