@@ -160,7 +160,7 @@ class DeferredValue:
 
 
 def defer(function: Callable[[], Any]) -> Any:
-    """Return a value for a deferred field: ``function()`` is called at the first use of the field."""
+    """Return a value for a deferred field, which calls ``function()`` when the field is first read."""
     return DeferredValue(function)
 
 
@@ -182,9 +182,8 @@ class _DeferredField:
         vars(instance)[self._name] = value
 
 
-def deferred_fields(*names: str) -> Callable[[Class], Class]:
-    """Decorate a dataclass so that the listed fields may hold a value of :func:`defer`, which is computed when it is
-    read."""
+def with_deferred_fields(*names: str) -> Callable[[Class], Class]:
+    """Return a class decorator that lets the named fields hold values of :func:`defer`, computed when first read."""
 
     def add_descriptors(cls: Class) -> Class:
         for name in names:
@@ -194,7 +193,7 @@ def deferred_fields(*names: str) -> Callable[[Class], Class]:
     return add_descriptors
 
 
-@deferred_fields("casimirs", "provenance")
+@with_deferred_fields("casimirs", "provenance")
 @dataclass(frozen=True)
 class Solution(AuditableResult):
     """The result of a run: times, states, energy, entropy and conserved quantities.

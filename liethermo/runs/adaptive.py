@@ -73,7 +73,7 @@ class Adaptive:
         for name in ("first", "largest"):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0.0):
-                raise InputError(f"{name} must be a positive and finite step size, got {value!r}")
+                raise InputError(f"the {name} step must be positive and finite, got {value!r}")
         if isinstance(self.most_steps, bool) or not isinstance(self.most_steps, int) or self.most_steps < 1:
             raise InputError(f"most_steps must be a positive integer, got {self.most_steps!r}")
 

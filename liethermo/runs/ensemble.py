@@ -42,7 +42,7 @@ from .record import EnsembleRecord, GroupRecord, TrajectoryGroup
 from .schedule import StepSchedule, make_schedule
 from .solution_builder import run_provenance
 from .system_family import Family, broadcast_size, error_message_or_empty
-from .time_features import schedule_around_features
+from .time_features import add_breaks_at_features_or_warn
 
 __all__ = ["MAX_THREADS", "Ensemble", "ensemble"]
 
@@ -215,7 +215,7 @@ class _EnsembleOptions(NamedTuple):
         method, family = problem.method, wrap_family_like_member(family, problem.system)
         initial_states = np.asarray(problem.system.initial_state(initial_states, schedule.start, attitude, batch=True))
         family_in_span = limit_time_functions_of_family(family, problem.system, schedule)
-        member = problem.system_in_span(schedule)
+        member = problem.system_limited_to_span(schedule)
         reasons = {
             int(trajectory_numbers[i]): text
             for i, text in _reasons_of_unstartable_members(family_in_span, member, method, initial_states).items()
@@ -233,10 +233,10 @@ class _EnsembleOptions(NamedTuple):
         if problem.is_driven:
             members = family.members_with_extreme_parameters()[: len(initial_states)]
             systems = [limit_time_functions_to_span(family.member(i), schedule) for i in members]
-            schedule = schedule_around_features(schedule, systems, initial_states[members], step)
+            schedule = add_breaks_at_features_or_warn(schedule, systems, initial_states[members], step)
             if schedule is not self.schedule:
                 family_in_span = limit_time_functions_of_family(family, problem.system, schedule)
-                member = problem.system_in_span(schedule)
+                member = problem.system_limited_to_span(schedule)
         events = None if self.until is None else EventSet(self.until, member, schedule.start, initial_states[0])
         control = noise_paths = None
         if tolerance is not None or events is not None:

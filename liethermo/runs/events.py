@@ -149,25 +149,25 @@ def _make_event(
     if not callable(user_event):
         raise InputError(f"until must be lt.Relaxed(tol) or a function of the state, got {user_event!r}")
     name = "the event function" if len(specification.events) == 1 else f"event function {event_index}"
-    direction = int(np.sign(event_direction(user_event)))
+    direction = int(np.sign(direction_attribute_of_event(user_event)))
     count = _n_zeros_to_end_run(user_event, default_terminal=scipy_arguments is None)
     function = _trace_event_function(user_event, name, scipy_arguments, system, start_time, initial_state)
     return name, function, direction, None if count is None else count - n_counted_before, scipy_arguments is not None
 
 
-def event_direction(event: Any) -> float:
+def direction_attribute_of_event(event_function: Any) -> float:
     """Return the attribute ``direction`` of an event function, with SciPy's meaning; 0 if it has none."""
-    return getattr(event, "direction", 0) or 0
+    return getattr(event_function, "direction", 0) or 0
 
 
-def event_terminal(event: Any, default: bool = False) -> Any:
+def terminal_attribute_of_event(event_function: Any, default: bool = False) -> Any:
     """Return the attribute ``terminal`` of an event function, with SciPy's meaning; ``default`` if it has none."""
-    return getattr(event, "terminal", default)
+    return getattr(event_function, "terminal", default)
 
 
 def _n_zeros_to_end_run(event_function: Any, default_terminal: bool) -> int | None:
     """Return the number of zeros of an event function after which the run ends; None if it never ends the run."""
-    terminal = event_terminal(event_function, default_terminal)
+    terminal = terminal_attribute_of_event(event_function, default_terminal)
     if terminal is None or terminal is False or terminal == 0:
         return None
     if int(terminal) != terminal or terminal < 0:

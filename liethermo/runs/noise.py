@@ -179,7 +179,7 @@ class Fluctuations(metaclass=ListedType):
         return list(self.seed) if isinstance(self.seed, list | tuple | np.ndarray) else [self.seed]  # type: ignore[list-item]
 
     def grid_seeds(self, grid_indices: Sequence[np.ndarray]) -> np.ndarray:
-        """Return a seed for each point of a grid, shape (points,), from its ``grid_indices`` along the axes."""
+        """Return a seed for each point of a grid, shape (points,), from its ``grid_indices`` along each axis."""
         return grid_seeds(self.seeds[0], grid_indices)
 
     def of(self, i: int) -> Fluctuations:
@@ -243,7 +243,7 @@ class Fluctuations(metaclass=ListedType):
         """Return increments of the Wiener processes in steps of one length, shape (trajectories, steps, count).
 
         The increments depend only on the seed, the trajectory, the start and the length of each step:
-        see :func:`codes_of_step_times`.
+        see :func:`integer_codes_of_step_times`.
 
         Parameters
         ----------
@@ -262,12 +262,14 @@ class Fluctuations(metaclass=ListedType):
             seeds, numbers = np.array(self.seeds), trajectories + self.first
         else:
             seeds, numbers = np.asarray(self.seeds)[trajectories], np.full(len(trajectories), self.first)
-        halvings, cells = codes_of_step_times(starts, length, step)
+        halvings, cells = integer_codes_of_step_times(starts, length, step)
         high_words, low_words = high_and_low_words(cells)
         values = np.empty((len(trajectories), len(cells), count))
         for high_word in np.unique(high_words):
             key = derive_key(
-                _key_of_steps(code_of_run_step(step), halvings, int(high_word)), high_and_low_words(seeds), (numbers, 0)
+                _random_key_of_steps(integer_code_of_step_size(step), halvings, int(high_word)),
+                high_and_low_words(seeds),
+                (numbers, 0),
             )
             values[:, high_words == high_word] = normal_numbers_of_steps(key, low_words[high_words == high_word], count)
         return np.sqrt(length) * np.clip(values, -MAX_STANDARD_DEVIATIONS, MAX_STANDARD_DEVIATIONS)
@@ -282,7 +284,7 @@ as possible from all simple fractions. In a run that starts at a simple fraction
 of a cell, where rounding would decide between two cells."""
 
 
-def codes_of_step_times(step_starts, step_length: float, run_step: float) -> tuple[int, np.ndarray]:
+def integer_codes_of_step_times(step_starts, step_length: float, run_step: float) -> tuple[int, np.ndarray]:
     """Return integers that identify steps by their times: one for their length, and one for each start, shape (steps,).
 
     Times are counted in units of ``run_step``. If the run starts at a multiple of it, the starts are
@@ -296,17 +298,17 @@ def codes_of_step_times(step_starts, step_length: float, run_step: float) -> tup
     return halvings, cells.astype(np.int64)
 
 
-def code_of_run_step(run_step: float) -> int:
+def integer_code_of_step_size(step_size: float) -> int:
     """Return an integer that identifies the step size of a run by the first 32 bits of its mantissa and its exponent.
 
     Steps such as ``(t1 - t0) / 10``, which differ in their last bits, have equal codes.
     """
-    mantissa, exponent = math.frexp(run_step)
+    mantissa, exponent = math.frexp(step_size)
     return (exponent << 31) + math.floor((mantissa - 0.5) * 2.0**32 + CELL_EDGE_FRACTION)
 
 
 @functools.lru_cache(256)
-def _key_of_steps(run_step_code: int, halvings: int, high_word: int) -> tuple[np.ndarray, np.ndarray]:
+def _random_key_of_steps(run_step_code: int, halvings: int, high_word: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the key of the generator for all steps whose time cells have this high word, two arrays of shape (1,)."""
     return derive_key(high_and_low_words([0]), high_and_low_words([run_step_code]), ([halvings], [high_word]))
 

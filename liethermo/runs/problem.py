@@ -92,11 +92,11 @@ class Problem:
                 return x
         return checked_initial_state(self.system, self.method, x0, t, attitude)
 
-    def system_in_span(self, schedule: StepSchedule) -> System:
+    def system_limited_to_span(self, schedule: StepSchedule) -> System:
         """Return the system with its functions of time evaluated only at times within the span of a schedule."""
         return limit_time_functions_to_span(self.system, schedule) if self.is_driven else self.system
 
-    def engine(
+    def engine_of_run(
         self, requested_engine: str, system: System, planned_steps: int, noise_increments: Callable | None = None
     ) -> EngineWithFallback:
         """Return an engine for a run in this thread; runs that do not depend on time or noise share engines.

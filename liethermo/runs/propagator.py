@@ -40,7 +40,7 @@ from .problem import Problem
 from .progress import Progress
 from .run import Run
 from .schedule import CHUNK_STEPS, ScheduleSegment, StepSchedule, checked_span, checked_step, make_schedule
-from .time_features import schedule_around_features
+from .time_features import add_breaks_at_features_or_warn
 from .varied_parameters import VariedParameters
 
 CONVERGENCE_FAILURES = tuple(
@@ -187,7 +187,7 @@ class Propagator(metaclass=ListedType):
         schedule = self._cached_schedule(t_span, save_every, save_at, allow_infinite_end, breaks, declared_times)
         x = problem.initial_state(x0, schedule.start, attitude)
         if problem.is_driven and isinstance(self.method, OneStepMethod):
-            schedule = schedule_around_features(schedule, [problem.system_in_span(schedule)], [x], step)
+            schedule = add_breaks_at_features_or_warn(schedule, [problem.system_limited_to_span(schedule)], [x], step)
         run = Run(problem, x, schedule, save_to, self.engine, dense)
         with Progress((schedule.start, schedule.end), progress) as bar:
             if isinstance(self.method, Reference):
@@ -334,7 +334,7 @@ class Propagator(metaclass=ListedType):
         segment = ScheduleSegment.from_span(start, end, h)
         if segment.n_full_steps > CHUNK_STEPS:
             return None  # a run in portions, which Ctrl-C can stop
-        trajectory = problem.engine(self.engine, problem.system, segment.n_steps).compiled_trajectory(
+        trajectory = problem.engine_of_run(self.engine, problem.system, segment.n_steps).compiled_trajectory(
             varied_parameters is not None
         )
         if trajectory is None:

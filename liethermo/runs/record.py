@@ -254,47 +254,47 @@ class GroupRecord:
     def __init__(self, record: EnsembleRecord, group: TrajectoryGroup):
         self.record, self.group, self.trajectory_numbers, self.engine = record, group, group.trajectory_numbers, ""
         self._is_all = len(self.trajectory_numbers) == len(record.status)
-        rows = self._record_rows(slice(None))
+        rows = self._row_indices_of_members(slice(None))
         record.status[rows] = StatusCode.INTERRUPTED
         record.quantities["first_step"][rows] = group.schedule.longest_step_after_each_save[0]
         record.quantities["end_time"][rows] = group.schedule.start
 
-    def _record_rows(self, members: MemberSelection) -> MemberSelection:
+    def _row_indices_of_members(self, members: MemberSelection) -> MemberSelection:
         """Return the rows of the record for the trajectories with these indices in the group."""
         return members if self._is_all else self.trajectory_numbers[members]
 
     @property
     def is_interrupted(self) -> bool:
         """True if the run of the group was interrupted: a trajectory has not reached its end, and has not failed."""
-        return bool((self.record.status[self._record_rows(slice(None))] == StatusCode.INTERRUPTED).any())
+        return bool((self.record.status[self._row_indices_of_members(slice(None))] == StatusCode.INTERRUPTED).any())
 
     def read_quantity(self, quantity_name: str, members: np.ndarray) -> np.ndarray:
         """Return the recorded values of a quantity, one for each of these trajectories."""
-        return self.record.quantities[quantity_name][self._record_rows(members)]
+        return self.record.quantities[quantity_name][self._row_indices_of_members(members)]
 
     def store_first_step_sizes(self, members: np.ndarray, step_sizes: np.ndarray) -> None:
         """Store the size of the first step of each of these trajectories."""
-        self.record.quantities["first_step"][self._record_rows(members)] = step_sizes
+        self.record.quantities["first_step"][self._row_indices_of_members(members)] = step_sizes
 
     def store_initial_states(
         self, members: MemberSelection, x: np.ndarray, energy: np.ndarray, entropy: np.ndarray
     ) -> None:
         """Store the initial states with energy and entropy, if trajectories are saved."""
         if self.record.trajectories is not None:
-            self.record.trajectories[self._record_rows(members), 0] = np.column_stack([x, energy, entropy])
+            self.record.trajectories[self._row_indices_of_members(members), 0] = np.column_stack([x, energy, entropy])
 
     def store_consecutive_saves(self, members: MemberSelection, first_save: int, states: np.ndarray) -> None:
         """Store saved states with energy and entropy, shape (members, saves, n + 2), from save ``first_save`` on."""
         if self.record.trajectories is not None:
             saves = slice(first_save, first_save + states.shape[1])
-            self.record.trajectories[self._record_rows(members), saves] = states
+            self.record.trajectories[self._row_indices_of_members(members), saves] = states
 
     def store_states_at_times(self, members: np.ndarray, times: np.ndarray, states: np.ndarray) -> None:
         """Store one state of each trajectory with energy and entropy, shape (members, n + 2), at its time to save."""
         if self.record.trajectories is not None:
-            self.record.trajectories[self._record_rows(members), np.searchsorted(self.record.saved_times, times)] = (
-                states
-            )
+            self.record.trajectories[
+                self._row_indices_of_members(members), np.searchsorted(self.record.saved_times, times)
+            ] = states
 
     def store_events(self, occurrences: Sequence[EventOccurrence], members: np.ndarray) -> None:
         """Store events of a batch, whose trajectories have the indices ``members`` in the group."""
@@ -318,7 +318,7 @@ class GroupRecord:
         status = np.where(is_unfinished, StatusCode.INTERRUPTED, final_fields["status"])
         self.record_outcome(members, initial_fields, final_fields, status, schedule.times_after(n_steps_taken))
         if self.record.trajectories is not None:
-            counts, rows = schedule.saved_step_counts, self._record_rows(members)
+            counts, rows = schedule.saved_step_counts, self._row_indices_of_members(members)
             is_after_end = np.arange(len(counts)) >= np.searchsorted(counts, n_steps_taken, side="right")[:, None]
             trajectories = self.record.trajectories
             trajectories[rows] = np.where(is_after_end[..., None], np.nan, trajectories[rows])
@@ -335,7 +335,7 @@ class GroupRecord:
     ) -> None:
         """Record status, end time, final state and audit quantities of trajectories, from first and last engine
         fields."""
-        record, group, rows = self.record, self.group, self._record_rows(members)
+        record, group, rows = self.record, self.group, self._row_indices_of_members(members)
         quantities, energy, initial_energy = record.quantities, final_fields["energy"], initial_fields["energy"]
         quantities["energy"][rows], quantities["entropy"][rows] = energy, final_fields["entropy"]
         drift = np.maximum(
@@ -435,7 +435,7 @@ class GroupRecord:
 
     def compute_velocities(self, velocity_name: str) -> np.ndarray:
         """Return velocities, shape (members, ..., k), at the recorded states of the group."""
-        rows, x, trajectories = self._record_rows(slice(None)), self.record.x, self.record.trajectories
+        rows, x, trajectories = self._row_indices_of_members(slice(None)), self.record.x, self.record.trajectories
         if trajectories is None:
             assert x is not None
             states = x[rows]

@@ -62,7 +62,7 @@ class Run:
 
     def __init__(self, problem: Problem, x0, schedule: StepSchedule, save_to, engine: str, dense: bool = False):
         self.problem, self.method, self.schedule = problem, problem.method, schedule
-        self.system = problem.system_in_span(schedule)
+        self.system = problem.system_limited_to_span(schedule)
         self.save_to, self.start_wall_time = save_to, time.perf_counter()
         self.last_checkpoint_time = self.start_wall_time
         self.saved_times = [np.array([schedule.start])]
@@ -83,7 +83,7 @@ class Run:
             def noise_increments(first_step: int, n_steps: int, h: float) -> np.ndarray:
                 return noise_paths.step_increments(slice(None), first_step, n_steps, h)[0]
 
-        self.engine = problem.engine(engine, self.system, schedule.n_steps, noise_increments)
+        self.engine = problem.engine_of_run(engine, self.system, schedule.n_steps, noise_increments)
 
     @property
     def last_saved_time(self) -> float:
@@ -150,7 +150,7 @@ class Run:
         saved_stop_times = self.schedule.saved_stop_times
         events = None if until is None else EventSet(until, self.system, start, self.saved_states[0][0])
         if events is not None and events.calls_python and self.engine.requested_engine == "auto":
-            self.engine = self.problem.engine("array", self.system, 0)  # machine code does not call Python
+            self.engine = self.problem.engine_of_run("array", self.system, 0)  # machine code does not call Python
         self.step, unsaved_steps = step, None
 
         def handle_accepted_steps(accepted_steps: AcceptedSteps):

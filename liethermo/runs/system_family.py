@@ -319,7 +319,7 @@ class Family:
 
     @property
     def is_per_trajectory(self) -> np.ndarray:
-        """Mask, shape (p,), of the parameter entries that have one value for each member."""
+        """Mask, shape (p,), of the parameter entries that differ between trajectories."""
         return np.concatenate(
             [np.zeros(0, bool), *(np.full(value[0].size, has_axis) for value, has_axis in self._arrays_with_axis_flags)]
         )

@@ -53,7 +53,7 @@ class TimeFeature(NamedTuple):
         return self.start == self.end
 
 
-def schedule_around_features(
+def add_breaks_at_features_or_warn(
     schedule: StepSchedule, systems: Sequence[System], initial_states: Iterable, step: float | Adaptive
 ) -> StepSchedule:
     """Return a schedule whose adaptive steps end at features, and warn if fixed steps skip a feature.
