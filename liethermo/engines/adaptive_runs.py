@@ -184,7 +184,7 @@ def _event_rounding_scale(event_model: tuple[System, Any], time_and_state) -> ja
     """Return the rounding error scale of an event function at (t, x), including the rounding of x itself."""
     (system, event_function), t, x = event_model, time_and_state[0], time_and_state[1:]
     return propagated_rounding_scale(
-        lambda y: event_function(system, t, y), x, jnp.maximum(jnp.abs(x), system.component_scales(x))
+        lambda y: event_function(system, t, y), x, jnp.maximum(jnp.abs(x), system.slope_scales(x))
     )
 
 
@@ -195,7 +195,7 @@ DIFFERENCE_STEP = 1e-6
 def _event_rounding_scale_by_differences(event_model: tuple[System, Any], time_and_state: np.ndarray) -> float:
     """Return the rounding error scale of an event function that cannot be traced, by that of x alone."""
     (system, event_function), t, x = event_model, time_and_state[0], time_and_state[1:]
-    scales, directions = np.maximum(np.abs(x), system.component_scales(x)), np.random.default_rng(0)
+    scales, directions = np.maximum(np.abs(x), system.slope_scales(x)), np.random.default_rng(0)
     derivatives = []
     for _ in range(4):
         h = DIFFERENCE_STEP * scales * directions.choice([-1.0, 1.0], len(x))

@@ -19,7 +19,7 @@ import numpy as np
 from ..integrators import OneStepMethod
 from ..integrators.base import event_check_fractions
 from ..systems import System
-from ..systems.clock import system_of_step
+from ..systems.clock import system_between_breaks
 from ..tracing.programs import jit_cached
 from . import root_bracket
 from .solver_options import DEFAULT_OPTIONS, EPS, SolverOptions
@@ -132,7 +132,9 @@ def accept_or_reject(
             control.allowed_error(norm) * jnp.minimum(time_fraction, 1.0),
             MIN_RELATIVE_ERROR * norm + DEFAULT_OPTIONS.tiny,
         )
-        error = method.error(system_of_step(system, old_state.x), old_state.x, old_state.compensation, h, new_state.k)
+        error = method.error(
+            system_between_breaks(system, old_state.x), old_state.x, old_state.compensation, h, new_state.k
+        )
         error = error / allowed_error
         error = jnp.where(is_solved, error, jnp.inf)
         is_accepted = error <= 1.0

@@ -205,7 +205,7 @@ class EngineWithFallback:
                     f"the sparse engine cannot run a {system.kind} that does not know its sparsity. Build the system "
                     "as a ComposedSystem of lt.Copies joined by lt.Each"
                 )
-        repays_compiling = self.planned_steps >= MIN_STEPS_TO_COMPILE or system.hints.has_matrix_functions
+        repays_compiling = self.planned_steps >= MIN_STEPS_TO_COMPILE or system.engine_hints.has_matrix_functions
         if self.requested_engine == "compiled" or (is_auto and is_worth_compiling(system, method)):
             compiled = CompiledEngine(system, method, planned_steps=self.planned_steps)
             try:
@@ -270,8 +270,8 @@ class Trajectory:
 
 def is_worth_compiling(system: System, method: OneStepMethod) -> bool:
     """Return whether compiling a step may pay off: it can be unrolled, has few components, and runs on the CPU."""
-    hints = system.hints
-    can_unroll = hints.can_unroll and (method.explicit or hints.can_unroll_newton)
+    engine_hints = system.engine_hints
+    can_unroll = engine_hints.can_unroll and (method.explicit or engine_hints.can_unroll_newton)
     return can_unroll and system.dim <= MAX_COMPILED_DIM and jax.default_backend() == "cpu"
 
 

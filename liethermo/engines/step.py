@@ -14,7 +14,7 @@ from ..integrators import OneStepMethod
 from ..integrators.base import is_permutation_equivariant, pullback_method
 from ..integrators.explicit import StepRow
 from ..systems import System
-from ..systems.clock import add_jump_of_energy, clock_components, system_of_step
+from ..systems.clock import add_energy_jump_to_work, keep_clock_components, system_between_breaks
 from ..systems.spins import reorder_spins
 from ..tracing.programs import jit_unoptimised
 from .solver_options import DEFAULT_OPTIONS, EPS, SolverOptions
@@ -149,9 +149,9 @@ def system_and_state_at_step_start(system: System, x, energy_before) -> tuple[Sy
     energy_before : array, shape ()
         The energy at the end of the last step, before a jump.
     """
-    step_system = system_of_step(system, x)
+    step_system = system_between_breaks(system, x)
     if system.clock is not None and system.clock.can_energy_jump:
-        x = add_jump_of_energy(system.clock, x, step_system.energy.value(x) - energy_before)
+        x = add_energy_jump_to_work(system.clock, x, step_system.energy.value(x) - energy_before)
     return step_system, x
 
 
@@ -223,7 +223,7 @@ def finish_step(
     new_x, new_compensation, energy, entropy = end.x, end.compensation, end.energy, end.entropy
     correction = state.energy_drift_correction
     if not method.carries_compensation:  # the next step computes its own, as the first step of a run does
-        new_compensation = clock_components(system, new_compensation)
+        new_compensation = keep_clock_components(system, new_compensation)
     elif can_correct_energy_drift(system, method):  # by the error of the last step: no step waits for its own energy
         new_compensation = compensation_after_drift_correction(system, new_x, new_compensation, correction)
         correction = energy_drift_multiplier(system, new_x, new_compensation, energy, state.first_energy)

@@ -20,7 +20,7 @@ from manifolds._pytree_module import Module
 from ..dissipation.geometry import project_tangent
 from ..integrators import OneStepMethod
 from ..systems import System
-from ..systems.clock import clock_components
+from ..systems.clock import keep_clock_components
 from ..tracing.programs import jit_cached
 from . import root_bracket
 from .solver_options import EPS
@@ -96,7 +96,7 @@ def _jacobian_product(system: System, x) -> Callable:
 
     def restrict(v) -> jax.Array:
         v = project_tangent(system, x, v)
-        return v - clock_components(system, v)
+        return v - keep_clock_components(system, v)
 
     return lambda v: restrict(jax.jvp(system.vector_field, (x,), (restrict(v),))[1])
 

@@ -33,7 +33,7 @@ from ..errors import InputError
 from ..functions.time_span import DeclaredTimes
 from ..integrators import OneStepMethod
 from ..systems import System
-from ..systems.clock import system_of_step
+from ..systems.clock import system_between_breaks
 from ..systems.kind_checks import require_system
 from ..tracing.programs import jit_cached, jit_unoptimised
 from .adaptive import Adaptive
@@ -205,7 +205,7 @@ def flow(
     x, declared = system.state(x0), DeclaredTimes.from_tree(system)
     schedule = make_schedule(t_span, step, save_every, breaks=breaks, declared=declared)
     times = None if save_at is None else checked_save_times(save_at, schedule)
-    n, user_system = system.dim, system
+    n, unwrap_user_system = system.dim, system
     system, method = prepare_for_method(system, method, None, attitude is not None)
     system = limit_to_span(system, schedule)
     initial_arguments = x, schedule.start, attitude
@@ -246,7 +246,7 @@ def flow(
     if times is not None:
         path = _path_at_times((system, method), path, schedule, times, compile_program)
     path = path if path.shape[-1] == n else path[..., :n]
-    return user_system.points(path) if user_system.space is None else path
+    return unwrap_user_system.points(path) if unwrap_user_system.space is None else path
 
 
 def _path_at_times(system_and_method, path, schedule: StepSchedule, times, compile_program: Callable) -> jax.Array:
@@ -389,7 +389,7 @@ def _recompute_path(system: System, method: OneStepMethod, x, step_sizes, steps:
 
         def step(x, solved_step, h=step_sizes[i]):
             _, compensation, k = solved_step
-            step_system = system_of_step(system, x)
+            step_system = system_between_breaks(system, x)
             k = _implicit_slopes(step_system, method, x, compensation, h, k)
             return method.move(step_system, x, compensation, h, k)[0], None
 
@@ -432,7 +432,7 @@ def differentiable_step(
 ) -> tuple[jax.Array, ...]:
     """Return the carry after a step that JAX can differentiate; NaN if its equations cannot be solved."""
     x, compensation, k, older_k = carry
-    system = system_of_step(system, x)
+    system = system_between_breaks(system, x)
     if method.explicit:
         new_k = _slopes_or_nan(explicit_stage_solution(system, method, x, compensation, h, k))
     else:

@@ -21,19 +21,19 @@ from manifolds._pytree_module import replace_fields
 from ..integrators import OneStepMethod
 from ..integrators.preserved import casimir_residuals, is_momentum_map, nonconservation_message
 from ..systems import System
-from ..systems.conservation import judge_conservation, rates_of_change
+from ..systems.conservation import function_rates_of_change, judge_conservation
 from ..systems.interface import InvariantVerdicts
 from ..systems.invariants import (
-    first_multiple_indices,
-    functions_for_naming,
+    first_proportional_indices,
     invariants_by_construction,
-    n_random_states,
-    names_from_multiples,
-    random_states,
+    n_test_states_per_scale,
+    name_preserved_functions,
+    named_then_preserved_functions,
+    random_test_states,
     stack_gradients,
     states_near,
     systems_at_test_times,
-    undecided_functions,
+    undecided_function_names,
 )
 from ..tracing.interpret import evaluate_at_points
 from .system_family import Family
@@ -104,10 +104,10 @@ def group_members_by_invariants(
     all_members, member = np.arange(len(states)), family.representative
     if member.invariant_verdicts is not None:
         return [MemberGroup(all_members, family)], {}
-    if not any(family.has_member_axis) and not undecided_functions(member):
+    if not any(family.has_member_axis) and not undecided_function_names(member):
         return [MemberGroup(all_members, family)], {}
     members = _MemberFunctions(family, member, method, states)
-    if not (members.casimirs or member.preserved or members.requested_functions):
+    if not (members.casimirs or member.preserved_functions or members.requested_functions):
         return [MemberGroup(all_members, family)], {}
     multiples, known_verdicts, requested_verdicts = (
         members.proportional_function_indices(),
@@ -178,13 +178,13 @@ class _MemberFunctions:
     def proportional_function_indices(self) -> np.ndarray:
         """Return, for each preserved function, the index of a function proportional to it, or -1: shape (B,
         preserved)."""
-        count = len(self.member.preserved)
+        count = len(self.member.preserved_functions)
         if not count:
             return np.zeros((len(self.states), 0), dtype=int)
-        points = random_states(self.member, 2)
-        values_per_member = len(points) * len(functions_for_naming(self.member)) * self.member.dim
+        points = random_test_states(self.member, 2)
+        values_per_member = len(points) * len(named_then_preserved_functions(self.member)) * self.member.dim
         return self._evaluate_in_batches(
-            lambda rows: first_multiple_indices(
+            lambda rows: first_proportional_indices(
                 self._evaluate_at(_gradients_for_naming, rows, self._rescaled_points_per_member(points, rows)), count
             ),
             values_per_member,
@@ -193,12 +193,12 @@ class _MemberFunctions:
     def verdicts_of_casimirs_and_preserved(self) -> np.ndarray:
         """Return verdicts on the Casimirs not conserved by construction, then on preserved functions: shape (B,
         functions)."""
-        count, member = len(self.casimirs) + len(self.member.preserved), self.member
+        count, member = len(self.casimirs) + len(self.member.preserved_functions), self.member
         verdicts = self._judge_functions(_casimir_and_preserved_rates, count, self.casimirs, use_nearby_states=True)
         # a torque may be zero at the test times only, so no function on which it acts counts as conserved
         torque = member.torque_laws
         has_torque = [name in torque.changed_casimirs for name in self.casimirs]
-        has_torque += [torque.name != ""] * len(member.preserved)
+        has_torque += [torque.name != ""] * len(member.preserved_functions)
         return np.where(np.array(has_torque, dtype=bool), VERDICT_NOT_CONSERVED, verdicts)
 
     def verdicts_of_requested_functions(self) -> np.ndarray:
@@ -229,7 +229,7 @@ class _MemberFunctions:
     def invariant_facts(self, multiples: np.ndarray, verdict_row: np.ndarray) -> InvariantFacts:
         """Return the facts of one member from its rows of indices and verdicts."""
         member = self.member
-        names = names_from_multiples(member, multiples.tolist())
+        names = name_preserved_functions(member, multiples.tolist())
         truth_values = {VERDICT_UNKNOWN: None, VERDICT_NOT_CONSERVED: False, VERDICT_CONSERVED: True}
         verdicts: dict[str, bool | None] = {}
         for name, verdict in zip((*names, *self.casimirs), np.roll(verdict_row, len(names)).tolist(), strict=True):
@@ -242,7 +242,7 @@ class _MemberFunctions:
     # -- verdicts -----------------------------------------------------------------------------------------------------
 
     def _judge_functions(self, rates: Callable, count: int, functions: tuple, use_nearby_states: bool) -> np.ndarray:
-        """Return verdicts on functions of each member, shape (B, count), by the rules of :func:`.conserves`.
+        """Return verdicts on functions of each member, shape (B, count), by the rules of :func:`.are_conserved`.
 
         With ``use_nearby_states``, states near the initial state are tried where random states leave a function
         undecided.
@@ -275,7 +275,7 @@ class _MemberFunctions:
                 is_defined[rows] |= result[:, 0]
                 is_violated[rows] |= result[:, 1]
 
-        random = random_states(member, n_random_states(member))
+        random = random_test_states(member, n_test_states_per_scale(member))
         for points in (random[:1], random[1:]):  # one state is enough to see that a function is not conserved
             open_members = np.flatnonzero(~is_violated.all(axis=1))
             try_states(open_members, functools.partial(self._rescaled_points_per_member, points), len(points))
@@ -314,7 +314,7 @@ class _MemberFunctions:
         parameters = self.family.parameter_matrix(rows, len(rows))
         scales = evaluate_at_points(_bath_entropy_scales, (self.family.form, parameters.shape[1]), parameters)[:, None]
         points = points.copy()
-        points[..., self.member.body_dim :] *= scales / baths.scale
+        points[..., self.member.body_dim :] *= scales / baths.constant_entropy_scales
         return points
 
     def _evaluate_in_batches(
@@ -336,20 +336,22 @@ def _member_and_state(form, p: int, row, time: int | None = None) -> tuple[Syste
 def _gradients_for_naming(model, row):
     form, p = model
     system, x = _member_and_state(form, p, row)
-    return stack_gradients(functions_for_naming(system), x)
+    return stack_gradients(named_then_preserved_functions(system), x)
 
 
 def _casimir_and_preserved_rates(model, row):
     form, p, casimirs, time = model
     system, x = _member_and_state(form, p, row, time)
     all_casimirs = system.casimirs()
-    return rates_of_change((system, (*(all_casimirs[name] for name in casimirs), *system.preserved)), x)
+    return function_rates_of_change(
+        (system, (*(all_casimirs[name] for name in casimirs), *system.preserved_functions)), x
+    )
 
 
 def _requested_rates(model, row):
     form, p, functions, time = model
     system, x = _member_and_state(form, p, row, time)
-    return rates_of_change((system, functions), x)
+    return function_rates_of_change((system, functions), x)
 
 
 def _requested_casimir_residuals(model, row):

@@ -372,7 +372,7 @@ class Propagator(metaclass=ListedType):
     def _varied_parameters(self, names: tuple[str, ...]) -> VariedParameters | None:
         """Return parameters that are arguments of machine code; None where they may decide which code runs."""
         problem = self._problem_of_final
-        if problem is None or not problem.has_fixed_domain or self.system.preserved:
+        if problem is None or not problem.has_fixed_domain or self.system.preserved_functions:
             return None
         try:
             return VariedParameters(self.system, self.method, names)
@@ -388,7 +388,7 @@ class Propagator(metaclass=ListedType):
         if has_undecided_invariants(self.system):  # what is conserved may depend on the initial state
             return None
         problem = self._problem()
-        return problem if problem.system.inner is None else None
+        return problem if problem.system.inner_system is None else None
 
 
 def _leave_to_run(x0) -> None:

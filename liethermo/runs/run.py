@@ -25,7 +25,7 @@ from ..results.events import Events
 from ..results.solution import DenseOutput, Solution, defer
 from ..results.status import Stats, Status
 from ..systems import System
-from ..systems.clock import system_of_step
+from ..systems.clock import system_between_breaks
 from ..tracing.interpret import evaluate_at_points
 from .adaptive import Adaptive, make_step_control
 from .adaptive_run import MAX_STORED_VALUES, AcceptedSteps, AdaptiveRun
@@ -323,7 +323,7 @@ class Run:
 
 def _energy_and_entropy_after_break(system: System, x) -> tuple[jax.Array, jax.Array]:
     """Return energy and entropy at x, shape (n,); at a break their limits from after, as the work has its jump."""
-    return energy_and_entropy_at(system_of_step(system, x), x)
+    return energy_and_entropy_at(system_between_breaks(system, x), x)
 
 
 def _longest_steps(schedule: StepSchedule, taken_steps: Sequence[np.ndarray], n_intervals: int) -> np.ndarray:

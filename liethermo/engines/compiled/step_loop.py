@@ -18,7 +18,7 @@ import numpy as np
 
 from ...integrators import OneStepMethod
 from ...integrators.fluctuating import noise_dimension, with_noise_increments
-from ...systems.clock import system_of_step
+from ...systems.clock import system_between_breaks
 from ...tracing.caching import LRUCache
 from ...tracing.calls import deferred_p
 from ...tracing.scalarize import report_compiler_faults, scalarize
@@ -218,7 +218,7 @@ class CompiledStepLoop:
         arrays = [packed[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, shapes, strict=True)]
         inputs = NewtonInputs(*arrays[len(NEWTON_OUTPUTS) :])
         equations = stage_equations(
-            system_of_step(system, inputs.x),
+            system_between_breaks(system, inputs.x),
             with_noise_increments(method, inputs.dW),
             inputs.x,
             inputs.compensation,
