@@ -175,8 +175,8 @@ class SpinSystem(TorqueSystem):
 
         Noise, precession and damping turn s at the angular velocity ``w - gamma dH - lambda s x dH``, w in
         ``noise_rates``, and damping has the factor ``lambda s . dH`` besides. The velocity ``other_noise_velocity`` is
-        added. So ``c u - a x u = r`` with the angle a in the time ``half_step``. The solution is ``u = (c r + a x r + (a . r) a / c) / (c^2 + |a|^2)``, as ``c a . u
-        = a . r``.
+        added. So ``c u - a x u = r`` with the angle a in the time ``half_step``. The solution is ``u = (c r + a x r +
+        (a . r) a / c) / (c^2 + |a|^2)``, as ``c a . u = a . r``.
         """
         spins, parts, n = self._spin_structure, _split_damping(self.total_dissipation), self.body_dim
         if spins is None or parts is None:
