@@ -17,7 +17,7 @@ import numpy as np
 from manifolds.errors import warn
 
 from ..engines.status_codes import StatusCode
-from ..engines.step import SavedStates, State, energy_and_entropy_at, system_and_state_at_step_start
+from ..engines.step import SavedStates, State, energy_and_entropy_at, system_and_state_after_jump
 from ..errors import FileError
 from ..integrators import Reference
 from ..integrators.fluctuating import noise_dimension
@@ -250,7 +250,7 @@ class Run:
         x, n_evaluations, energy = np.array(self.saved_states[0]), 0, self.saved_energies_entropies[0][0, 0]
         clock = self.system.clock
         for first, last in itertools.pairwise([0, *break_indices.tolist(), len(times) - 1]):
-            system, x[-1] = system_and_state_at_step_start(self.system, jnp.asarray(x[-1]), energy)
+            system, x[-1] = system_and_state_after_jump(self.system, jnp.asarray(x[-1]), energy)
             states, n, message, was_interrupted = self.method.trajectory(system, x[-1], times[first : last + 1])
             x, n_evaluations = np.concatenate([x, states[1:]]), n_evaluations + n
             if message or was_interrupted or len(states) <= last - first:

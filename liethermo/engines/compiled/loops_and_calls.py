@@ -42,9 +42,9 @@ def write_block(writer: Any, block: Block, args: Sequence[Any]) -> BlockResults:
 
 def clamp_index(writer: Any, index: ir.Value, length: int) -> ir.Value:
     """Clamp an index to the range of a table of ``length`` entries."""
-    build, last = writer.builder, writer.constant(length - 1)
+    build, last_index = writer.builder, writer.constant(length - 1)
     index = build.select(build.icmp_signed("<", index, writer.constant(0)), writer.constant(0), index)
-    return build.select(build.icmp_signed(">", index, last), last, index)
+    return build.select(build.icmp_signed(">", index, last_index), last_index, index)
 
 
 def select_entry(writer: Any, index: ir.Value, entries: Sequence[ir.Value]) -> ir.Value:

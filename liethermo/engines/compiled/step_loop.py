@@ -189,33 +189,40 @@ class CompiledStepLoop:
         if not control:
             h, *fields = inputs
             return take_step(
-                system, with_noise_increments(method, dW), State(*fields), h, self._options, self._newton_fallback(dW)
+                system,
+                with_noise_increments(method, dW),
+                State(*fields),
+                h,
+                self._options,
+                self._make_newton_fallback(dW),
             )
         previous_state = AdaptiveState(State(*inputs[: len(STATE_FIELDS)]), *inputs[len(STATE_FIELDS) :])
         adaptive_state = attempt_step(
-            system, method, control[0], previous_state, self._options, self._newton_fallback(dW)
+            system, method, control[0], previous_state, self._options, self._make_newton_fallback(dW)
         )
         return *adaptive_state.state, *adaptive_state[1:]
 
-    def _newton_fallback(self, dW) -> Callable:
+    def _make_newton_fallback(self, noise_increments) -> Callable:
         """Return the fallback for :func:`..step.take_step`: a program compiled at its first use."""
 
         def bind_deferred_newton(fixed_point_result: StageSolution, *stage_inputs) -> StageSolution:
             initial_outputs = [1.0 * getattr(fixed_point_result, name) for name in NEWTON_OUTPUTS]
             outputs = deferred_p.bind(
-                *initial_outputs, dW, *(jnp.asarray(a) for a in stage_inputs), results=len(NEWTON_OUTPUTS)
+                *initial_outputs, noise_increments, *(jnp.asarray(a) for a in stage_inputs), results=len(NEWTON_OUTPUTS)
             )
             solution = fixed_point_result._replace(**dict(zip(NEWTON_OUTPUTS, outputs, strict=True)))
             return solution._replace(converged=solution.converged > 0.0, is_finite=solution.is_finite > 0.0)
 
         return bind_deferred_newton
 
-    def _solve_packed_newton(self, p, packed) -> tuple:
+    def _solve_packed_newton(self, p, packed_buffer) -> tuple:
         """Run Newton's method on the packed outputs and inputs; return the new outputs."""
         system, method, *_ = self.build_modules(p)
         shapes = [self.field_shape(name) for name in (*NEWTON_OUTPUTS, *NEWTON_INPUTS)]
         ends = itertools.accumulate(map(math.prod, shapes))
-        arrays = [packed[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, shapes, strict=True)]
+        arrays = [
+            packed_buffer[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, shapes, strict=True)
+        ]
         inputs = NewtonInputs(*arrays[len(NEWTON_OUTPUTS) :])
         equations = stage_equations(
             system_between_breaks(system, inputs.x),
@@ -395,9 +402,9 @@ class CompiledStepLoop:
             return EMPTY_INCREMENTS
         if noise is None:
             return np.zeros((n_blocks, n_steps, n_increments, self.lanes))
-        padded = np.zeros((n_blocks * self.lanes, n_steps, n_increments))
-        padded[: len(noise)] = noise
-        return np.ascontiguousarray(padded.reshape(n_blocks, self.lanes, n_steps, -1).transpose(0, 2, 3, 1))
+        padded_noise = np.zeros((n_blocks * self.lanes, n_steps, n_increments))
+        padded_noise[: len(noise)] = noise
+        return np.ascontiguousarray(padded_noise.reshape(n_blocks, self.lanes, n_steps, -1).transpose(0, 2, 3, 1))
 
     # -- machine code -------------------------------------------------------------------------------------------------
 
