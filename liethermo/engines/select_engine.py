@@ -164,9 +164,9 @@ class EngineWithFallback:
         """Return the states, shape (m, n), after one step from each state of x; NaN if a step fails."""
         return self._call_with_fallback(lambda engine, _: engine.step_ends(x, h))
 
-    def _noise_increments(self, state: State, steps: int, h) -> np.ndarray | None:
+    def _noise_increments(self, state: State, n_steps: int, h) -> np.ndarray | None:
         """Return the noise increments of the next steps, shape (steps, increments); None without noise."""
-        return None if self.noise is None else self.noise(int(state.step), steps, h)
+        return None if self.noise is None else self.noise(int(state.step), n_steps, h)
 
     def start_adaptive(self, control: StepControl, x, t: float, stop_time: float, span_length: float) -> AdaptiveRuns:
         """Return an adaptive run from x at time t, on the engine that is chosen for it."""

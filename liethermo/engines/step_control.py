@@ -43,7 +43,7 @@ def probe_jacobian(system: System, x) -> jax.Array:
     For at most :data:`DENSE_JACOBIAN_DIM` components the probe is the Jacobian matrix, shape (n, n). Otherwise it has
     shape (:data:`POWER_ITERATIONS`, n): the images of normalised iterates of the power method.
     """
-    jacobian_product, n = _jacobian_product(system, x), x.shape[0]
+    jacobian_product, n = _make_jacobian_product(system, x), x.shape[0]
     if n <= DENSE_JACOBIAN_DIM:
         return jax.vmap(jacobian_product)(jnp.eye(n)).T
 
@@ -61,7 +61,7 @@ def arnoldi_hessenberg(system, method, x):
     Its eigenvalues approximate the extremal eigenvalues of the Jacobian.
     """
     system, x = system.solved_subsystem(x)
-    jacobian_product, n = _jacobian_product(system, x), x.shape[0]
+    jacobian_product, n = _make_jacobian_product(system, x), x.shape[0]
     m = min(n, KRYLOV_DIM)
 
     def arnoldi_step(carry, i):
@@ -87,7 +87,7 @@ def arnoldi_hessenberg(system, method, x):
     return matrix[:m]
 
 
-def _jacobian_product(system: System, x) -> Callable:
+def _make_jacobian_product(system: System, x) -> Callable:
     """Return a function that multiplies tangent vectors by the Jacobian of the vector field at x.
 
     Rows and columns of the time and the work are zero: nothing grows by them, and in the unit of the clock derivatives

@@ -336,7 +336,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         return project_off(term.force(system, u, dH, project_off(dS), dL))
 
     def _functions_to_project_off(
-        self, term: Dissipation, preserved_function_names: set[str], system: System
+        self, term: Dissipation, preserved_names: set[str], system: System
     ) -> dict[str, Energy]:
         """Return the functions, by name, whose gradients are projected off the force of a dissipation.
 
@@ -349,7 +349,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         casimirs = {ENTROPY_KEY, *self._casimir_names(system)} if term.preserves_casimirs else set()
 
         def is_kept_by_construction(name: str, C: Energy) -> bool:
-            return name in preserved_function_names or (C.is_quadratic and (gradients_are_exact or name in casimirs))
+            return name in preserved_names or (C.is_quadratic and (gradients_are_exact or name in casimirs))
 
         return (
             {}

@@ -96,7 +96,7 @@ class WithAttitude(MethodWrapper):
 
     def slopes(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:  # type: ignore[override]
         """Return the slopes of the momentum; for an explicit method also those of the rotation angles."""
-        method, mu, mu_compensation = self.method, system.points(x), system.points(compensation)
+        method, mu, mu_compensation = self.method, system.body_states(x), system.body_states(compensation)
         if self.explicit:
             local = AttitudeChartSystem(system, self.order, system.attitude_layout.split_state(x)[1])
             return pullback_method(method, local).slopes(
@@ -115,7 +115,7 @@ class WithAttitude(MethodWrapper):
 
     def start(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
         if not self.explicit:
-            return self.method.start(system.body_at_attitude(x), system.points(x))
+            return self.method.start(system.body_at_attitude(x), system.body_states(x))
         mu, g = system.attitude_layout.split_state(x)
         local, n = AttitudeChartSystem(system, self.order, g), system.group.dim
         k = self.method.start(
@@ -127,7 +127,11 @@ class WithAttitude(MethodWrapper):
 
     def error(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:  # type: ignore[override]
         return self.method.error(
-            system.body_at_attitude(x), system.points(x), system.points(compensation), h, system.points(k)
+            system.body_at_attitude(x),
+            system.body_states(x),
+            system.body_states(compensation),
+            h,
+            system.body_states(k),
         )
 
     def attitude_rate(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
@@ -150,7 +154,7 @@ class WithAttitude(MethodWrapper):
             layout.split_state(x),
             layout.split_state(compensation),
         )
-        new_mu, new_mu_compensation = self.method.move(system.body, mu, mu_compensation, h, system.points(k))
+        new_mu, new_mu_compensation = self.method.move(system.body, mu, mu_compensation, h, system.body_states(k))
         if self.explicit:
             return self._apply_explicit_step(system, x, compensation, new_mu, new_mu_compensation, h, k)
         xi = (
@@ -205,7 +209,7 @@ class WithAttitude(MethodWrapper):
         local = AttitudeChartSystem(system, self.order, g)
         method: Any = pullback_method(self.method, local)
         end = method.step_without_compensation(local, local.coordinates_of_state(x), h)
-        return layout.join_state(system.points(end), g @ group.exp_map(group.algebra, local.rotation_angles(end)))
+        return layout.join_state(system.body_states(end), g @ group.exp_map(group.algebra, local.rotation_angles(end)))
 
     def _attitude_increment(self, group, stage_angles) -> jax.Array:
         """Return the group element that rotates the attitude, for angles h xi at the stages, shape (stages, dim)."""
@@ -243,7 +247,10 @@ class WithAttitude(MethodWrapper):
 
     def _stage_torques(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:
         """Return the torques at the stages, shape (stages, body components without the clock)."""
-        body, states = system.body, system.points(x) + (system.points(compensation) + h * (gauss_tableau(len(k)).A @ k))
+        body, states = (
+            system.body,
+            system.body_states(x) + (system.body_states(compensation) + h * (gauss_tableau(len(k)).A @ k)),
+        )
         if not body.torque_laws.needs_attitude:
             return jax.vmap(body.external_torque)(states)
         attitudes = self._stage_attitudes(system, x, compensation, h, k)
@@ -266,7 +273,7 @@ class WithAttitude(MethodWrapper):
         """Displace the momentum alone: functions evaluated inside a step depend on it only."""
         layout = system.attitude_layout
         mu, g = layout.split_state(x)
-        return layout.join_state(mu + system.points(v), g, layout.impulse(x))
+        return layout.join_state(mu + system.body_states(v), g, layout.impulse(x))
 
     @staticmethod
     def _coadjoint_increment(group, stage_angles) -> jax.Array:

@@ -205,7 +205,7 @@ def flow(
     x, declared = system.state(x0), DeclaredTimes.from_tree(system)
     schedule = make_schedule(t_span, step, save_every, breaks=breaks, declared=declared)
     times = None if save_at is None else checked_save_times(save_at, schedule)
-    n, unwrap_user_system = system.dim, system
+    n, user_system = system.dim, system
     system, method = prepare_for_method(system, method, None, attitude is not None)
     system = limit_to_span(system, schedule)
     initial_arguments = x, schedule.start, attitude
@@ -246,7 +246,7 @@ def flow(
     if times is not None:
         path = _path_at_times((system, method), path, schedule, times, compile_program)
     path = path if path.shape[-1] == n else path[..., :n]
-    return unwrap_user_system.points(path) if unwrap_user_system.space is None else path
+    return user_system.points(path) if user_system.space is None else path
 
 
 def _path_at_times(system_and_method, path, schedule: StepSchedule, times, compile_program: Callable) -> jax.Array:

@@ -106,7 +106,7 @@ class AttitudeSystem(LiftedSystem):
         return self.body.bind_attitude(self.attitude_layout.split_state(x)[1])
 
     def solved_subsystem(self, x) -> tuple[System, jax.Array]:
-        return self.body_at_attitude(x), self.points(x)
+        return self.body_at_attitude(x), self.body_states(x)
 
     def momentum_to_space_matrix(self, g) -> jax.Array:
         """Return the matrix A, shape (..., n, n), that maps a body momentum to space, ``mu @ A``, at the attitude g."""
@@ -140,12 +140,16 @@ class AttitudeSystem(LiftedSystem):
             mu, g, jnp.einsum("...a,...ab->...b", mu[..., : self.group.dim], self.momentum_to_space_matrix(g))
         )
 
-    def points(self, x):
+    def body_states(self, x) -> jax.Array:
         """Return the states of the body, shape (..., body.dim), from states with an attitude, shape (..., n)."""
         return x[..., : self.body.dim]
 
+    def points(self, x):
+        """Return the states of the body, of which energy, entropy and Casimirs are functions."""
+        return self.body_states(x)
+
     def user_state(self, x):
-        return self.body.user_state(self.points(x))
+        return self.body.user_state(self.body_states(x))
 
     def slope_scales(self, slopes):
         """Return the scale of each component of slopes, shape (..., n), separate for momenta and for attitudes."""
@@ -162,7 +166,7 @@ class AttitudeSystem(LiftedSystem):
             attitude_residual=self.max_attitude_residual(solution.x),
             spatial_momentum_change=self.max_spatial_momentum_change(solution.x),
         )
-        dense = None if solution.dense is None else solution.dense.with_output_map(self.points)
+        dense = None if solution.dense is None else solution.dense.with_output_map(self.body_states)
         series = {name: f - f[0] if name in self.impulse_names else f for name, f in solution.casimirs.items()}
         body_solution = dataclasses.replace(solution, x=np.asarray(states), dense=dense, stats=stats, casimirs=series)
         body_solution = self.body.to_user_solution(body_solution)
@@ -217,7 +221,7 @@ class AttitudeSystem(LiftedSystem):
 
     def attitude_velocity(self, x) -> jax.Array:
         """Return the velocity xi of the attitude at a state, ``g' = g hat(xi)``, shape (group.dim,)."""
-        mu, body = self.points(x), self.body_at_attitude(x)
+        mu, body = self.body_states(x), self.body_at_attitude(x)
         dS = body.entropy_gradient(mu)
         xi = body.transport_covector(
             mu, body.energy.gradient(mu), dS, tuple(L.gradient(mu) for L in body.preserved_functions)
@@ -337,7 +341,7 @@ class AttitudeChartSystem(LiftedSystem):
         """Return the coordinates (mu, 0, impulse) of a state x at the centre of the chart, shape (dim,)."""
         return jnp.concatenate(
             [
-                self.attitude_system.points(x),
+                self.attitude_system.body_states(x),
                 jnp.zeros(self.attitude_system.group.dim),
                 ANGLE_UNIT * self.attitude_system.attitude_layout.impulse(x),
             ]

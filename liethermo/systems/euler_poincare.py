@@ -331,7 +331,7 @@ class EulerPoincareClosedSystem(LedgerSystem):
 
     def momentum_jacobians(self, x) -> tuple[jax.Array, jax.Array]:
         structure = cast(VelocityLiePoisson, self.poisson_without_ledger)
-        return structure.momentum_derivatives(x[: self.dim_without_ledger])[1:]
+        return structure.momentum_and_derivatives(x[: self.dim_without_ledger])[1:]
 
     @property
     def motion_quantities(self) -> MotionQuantities:
@@ -380,18 +380,18 @@ class VelocityLiePoisson(PoissonBySharp):
     def dim(self) -> int:
         return self.algebra.dim + 1
 
-    def momentum_derivatives(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def momentum_and_derivatives(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return the momentum ``l_xi`` and its derivatives by xi and S, shapes (n,), (n, n) and (n,)."""
         momentum = jax.grad(self.lagrangian)
         xi_derivative, S_derivative = jax.jacfwd(momentum, argnums=(0, 1))(x[:-1], x[-1])
         return momentum(x[:-1], x[-1]), xi_derivative, S_derivative
 
     def sharp(self, x, alpha) -> jax.Array:
-        mu, W, _ = self.momentum_derivatives(x)
+        mu, W, _ = self.momentum_and_derivatives(x)
         xi = solve(W, alpha[:-1, None])[:, 0]
         return jnp.append(solve(W, self.algebra.ad_star(xi, mu)[:, None])[:, 0], 0.0)
 
 
 def _hessian(structure: VelocityLiePoisson, x):
     """Return the Hessian of the Lagrangian in the velocity at a state, shape (n, n)."""
-    return structure.momentum_derivatives(x)[1]
+    return structure.momentum_and_derivatives(x)[1]

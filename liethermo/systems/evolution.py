@@ -218,7 +218,7 @@ def configuration_space(contact: mf.SplitContact) -> mf.Space | None:
     return contact.bundle.base if isinstance(contact.bundle, mf.TangentBundle) else None
 
 
-def check_space(space) -> mf.Space:
+def checked_space(space) -> mf.Space:
     """Return the space of positions, or raise an InputError if it is not a space."""
     if not isinstance(space, mf.Space):
         raise InputError(f"space must be a manifolds.Space, such as mf.Sphere(2), got {type(space).__name__}")
@@ -229,7 +229,7 @@ def state_dim(dim: int | None, space: mf.Space | None) -> int:
     """Return the number of components of a state (q, p, S), from dim or from the space of q."""
     if space is None:
         return 2 * n_degrees_of_freedom(dim) + 1
-    if dim not in (None, n := 2 * check_space(space).size + 1):
+    if dim not in (None, n := 2 * checked_space(space).size + 1):
         raise InputError(f"on {space.name} a state (q, p, S) must have {n} components, got dim={dim}. Leave dim out")
     return n
 
@@ -250,7 +250,7 @@ def join_arguments(function, space: mf.Space | None = None):
     """Return a function of (q, p, S) as a function of the state in one array; anything else unchanged."""
     if not callable(function) or isinstance(function, Energy) or required_argument_count(function) != 3:
         return function
-    return JoinedArguments(function, None if space is None else check_space(space).shape)
+    return JoinedArguments(function, None if space is None else checked_space(space).shape)
 
 
 def n_degrees_of_freedom(dim: int | None) -> int:

@@ -325,13 +325,15 @@ class RotatingFrame(metaclass=ListedType):
             if abs(omega + frequency) <= tolerance:
                 resonant += 0.5 * np.exp(-1j * phase) * component
         if D.any() and not resonant.any():
-            found = ", ".join(f"{omega:.6g}" for omega in self.components(D) if omega >= 0.0)
+            frequency_text = ", ".join(f"{omega:.6g}" for omega in self.components(D) if omega >= 0.0)
             raise InputError(
-                f"no part of the drive is at rest in the frame: its frequencies there are {found}, and that of the "
-                f"drive is {frequency:.6g}. Give the frame a generator whose level distances contain that frequency"
+                f"no part of the drive is at rest in the frame: its frequencies there are {frequency_text}, and that "
+                f"of the drive is {frequency:.6g}. Give the frame a generator whose level distances contain that frequency"
             )
-        at_rest = self.components(H)
-        static = sum((V for omega, V in at_rest.items() if abs(omega) <= self._tolerance), np.zeros_like(H))
+        components_of_constant = self.components(H)
+        static = sum(
+            (V for omega, V in components_of_constant.items() if abs(omega) <= self._tolerance), np.zeros_like(H)
+        )
         H = static - self.generator + resonant
         return (H + adjoint(H)) / 2
 

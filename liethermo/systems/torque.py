@@ -93,7 +93,7 @@ class TorqueSystem(System):
 
 
 def traced_torque_and_argument_counts(
-    given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | None
+    user_torque: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | None
 ) -> tuple[Any, tuple[int, ...]]:
     """Return a torque with its functions checked and traced, and the number of arguments of each term.
 
@@ -103,9 +103,9 @@ def traced_torque_and_argument_counts(
         If it is not a function of t, (t, mu), (t, mu, attitude) or (t, mu, attitude, velocity) to a dual vector; or if
         there is no attitude.
     """
-    if given is None:
+    if user_torque is None:
         return None, ()
-    terms = _torque_terms(given)
+    terms = _torque_terms(user_torque)
     if not terms:
         raise InputError("torque is an empty list: a system without a torque is given None")
     argument_counts = tuple(map(_checked_argument_count, terms))
@@ -120,9 +120,9 @@ def traced_torque_and_argument_counts(
         attitude = g[0] if len(g) == 1 else g[0] + 1j * g[1]
         return [jnp.asarray(value) for value in _evaluate_terms(torque, argument_counts, t, mu, attitude, velocity)]
 
-    given = terms if isinstance(given, list) else given
+    user_torque = terms if isinstance(user_torque, list) else user_torque
     try:
-        torque, values = trace_callables_and_result_shapes(given, evaluate_terms, *shapes)
+        torque, values = trace_callables_and_result_shapes(user_torque, evaluate_terms, *shapes)
     except InputError:  # of a torque of the library, which says what it needs
         raise
     except IndexOutOfRangeError as error:

@@ -238,9 +238,9 @@ def test_a_torque_frozen_at_one_time_is_not_run():
     push = lt.torques.ConstantInBody([0.1, 0.0, 0.0])
     for torque, arguments in ((push, (0.3,)), (lambda t, mu, A: A[0], (0.3, np.eye(3)))):
         system = body(lambda m: m @ m, torque=torque, group=mf.SO(3))
-        freeze_system = system.at_time(*arguments)
-        assert np.isfinite(freeze_system.vector_field(jnp.asarray(START))).all()
+        frozen_system = system.at_time(*arguments)
+        assert np.isfinite(frozen_system.vector_field(jnp.asarray(START))).all()
         for attempt in (run, lambda s: lt.flow(s, START, SPAN, STEP), lambda s: lt.ensemble(s, [START], SPAN, STEP)):
             with pytest.raises(lt.InputError, match=r"frozen it\. Run the system itself"):
-                attempt(freeze_system)
+                attempt(frozen_system)
         assert run(system).audit().passed

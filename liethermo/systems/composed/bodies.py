@@ -62,7 +62,7 @@ class Subsystem(Module):
         self.energy = with_polynomial_degrees(
             checked_energy(energy, dim, f"the energy of {name or 'a subsystem'}"), dim
         )
-        self.friction = _check_friction(friction, dim - species, name or "a subsystem")
+        self.friction = _checked_friction(friction, dim - species, name or "a subsystem")
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -121,7 +121,7 @@ class Copies(Module):
             checked_numbers(a, f"the parameters of {name or 'the bodies'}") for a in parameter_tuple
         )
         self.energy_of_whole_state(0)  # checked there
-        self.friction = _check_copies_friction(friction, count, dim, name or "the bodies")
+        self.friction = _checked_copies_friction(friction, count, dim, name or "the bodies")
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -167,7 +167,7 @@ def _check_dim(dim) -> None:
         raise InputError(f"dim, the size of a state (q, p, S), must be 2n + 1, or 1 for S alone, got {dim!r}")
 
 
-def _check_friction(friction, dim: int, name: str):
+def _checked_friction(friction, dim: int, name: str):
     """Return the friction of a body as a checked array, shape (n,) or (n, n), function, "contact" or None."""
     n = dim // 2
     if friction is None:
@@ -188,10 +188,10 @@ def _check_friction(friction, dim: int, name: str):
     return _require_nonnegative(R, name)
 
 
-def _check_copies_friction(friction, count: int, dim: int, name: str):
+def _checked_copies_friction(friction, count: int, dim: int, name: str):
     """Return the friction of copies of a body as a checked array, shape (count, n), "contact" or None."""
     if friction is None or isinstance(friction, str):
-        return _check_friction(friction, dim, name)
+        return _checked_friction(friction, dim, name)
     n, R = dim // 2, checked_numbers(friction, f"friction of {name}")
     if n == 0 or R.shape not in ((), (n,), (count, n)):
         raise InputError(
