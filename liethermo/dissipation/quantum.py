@@ -148,7 +148,7 @@ class ThermalJumps(Dissipation):
                 "ThermalJumps need the eigenvectors of the Hamiltonian, so it must not be a traced value. Build a "
                 "system for each Hamiltonian, as lt.Study does. Rates, temperatures and capacities may be traced"
             )
-        hamiltonians = system.hamiltonians()
+        hamiltonians = system.hamiltonians_at_test_times()
         if not baths.number:
             jumps = tuple(Jump(V, i, 0.5 if is_hermitian(V) else 1.0) for i, V in enumerate(self.operators))
             conserves_energy = all(is_commuting(H, V) for H in hamiltonians for V in map(np.asarray, self.operators))

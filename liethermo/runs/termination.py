@@ -256,7 +256,7 @@ def final_status(engine: EngineWithFallback, state, t: float, h: float, interrup
             + _try_shorter_steps_and_advise(engine, state, h)
         )
         return Status(StatusCode.NOT_CONVERGED, message, step, t, residual)
-    if engine.system.surface is not None and (
+    if engine.system.constraint_surface is not None and (
         reason := engine.system.domain.why_outside(_predicted_state(engine, state, h))
     ):
         text = f"{step_text}, could not be taken: {reason}. Try a smaller step, where the motion itself stays inside"
