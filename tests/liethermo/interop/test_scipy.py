@@ -233,7 +233,7 @@ def test_arguments_of_scipy():
 
 @pytest.mark.parametrize("call", [lt.scipy.solve_ivp, lambda system, span, x0: lt.integrate(system, x0, span, 0.1)])
 def test_the_advice_on_a_span_that_runs_backwards(call):
-    """The advice leads from the end of a run back to its start, with friction and with an energy that needs the time."""
+    """The advice leads from the end of a run back to its start, with friction and in a driven system."""
     driven = lt.MetriplecticSystem(mf.Canonical(1), lambda x, t: 0.5 * (x @ x) - jnp.sin(3.0 * t) * x[0])
     for system, x0, span in ((BODY, X0, SPAN), (driven, [0.4, -0.2], (0.1, 2.7))):
         with pytest.raises(lt.InputError, match="finite and increasing") as error:

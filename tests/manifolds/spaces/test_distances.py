@@ -195,7 +195,7 @@ def test_hyperbolic_points_beyond_the_range_of_squares():
         for call in (lambda y=y: space.point(y), lambda y=y: space.log(apex, y)):
             with pytest.raises(mf.DomainError, match=message):
                 call()
-    with pytest.raises(mf.DomainError, match="cannot be projected: it is 500.* from the apex"):
+    with pytest.raises(mf.DomainError, match=r"cannot be projected: it is 500.* from the apex"):
         space.project(hyperbolic_point(500.0, 0.0))
     with pytest.raises(mf.DomainError, match=r"exp\(x, v\) exceeds the range of double precision"):
         space.exp(apex, [0.0, 400.0, 0.0])
