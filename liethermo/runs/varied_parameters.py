@@ -25,7 +25,7 @@ from ..systems.invariants import (
     random_states,
 )
 from ..tracing.trace_errors import TRACE_ERRORS
-from .named_parameters import conditions_by_leaf, find_parameter
+from .named_parameters import find_parameter
 from .preparation import prepare_system_and_method
 from .problem import Problem
 
@@ -79,13 +79,6 @@ class VariedParameters:
         self.entries = np.concatenate([self._leaves[i].ravel() for i in self._varied_leaves])
         slots = iter(self._split(self.entries))
         self._slots = [(parameter, [next(slots) for _ in parameter.leaves]) for parameter in parameters]
-        conditions = conditions_by_leaf(system)
-        self._conditions = [
-            (conditions[i].test, slot)
-            for parameter, slots_of_leaves in self._slots
-            for i, slot in zip(parameter.leaves, slots_of_leaves, strict=True)
-            if i in conditions
-        ]
         self._functions = tuple(
             name for name in named_functions(system) if name not in invariants_by_construction(system)
         )
@@ -106,11 +99,11 @@ class VariedParameters:
             array = np.asarray(value, dtype=np.float64)
             if array.shape != parameter.value.shape:
                 return None
+            if parameter.condition is not None and not parameter.condition.holds(array):
+                return None
             leaf = parameter.to_leaf(array)
             for slot in slots:
                 slot[...] = leaf
-        if not all(test(slot).all() for test, slot in self._conditions):
-            return None
         if self._test is not None:
             self._codes = self._test().min(axis=0).tolist()
             if not all(code in (0.0, CONSERVED_CODE) for code in self._codes):

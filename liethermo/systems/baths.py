@@ -17,6 +17,8 @@ from manifolds.structures.poisson import ProductPoisson
 
 from ..errors import InputError
 from ..functions.bath_energy import (
+    BATH_CAPACITY_CONDITION,
+    BATH_TEMPERATURE_CONDITION,
     BathEnergy,
     DrivenReservoirEnergy,
     ReservoirEnergy,
@@ -25,7 +27,7 @@ from ..functions.bath_energy import (
     make_bath_energy,
 )
 from ..functions.checks import traced_function_and_shape
-from ..functions.conditions import checked_numbers
+from ..functions.conditions import Condition, checked_numbers
 from ..functions.energy import Energy, Sum
 from ..functions.mechanics import Each
 from ..tracing.short_form import format_arguments
@@ -101,15 +103,15 @@ class HeatBaths(Module):
         temperatures = _entries_of_baths(temperature, "temperature", number)
         driven = [i for i, T in enumerate(temperatures) if callable(T) and functions[i] is None]
         if not driven and all(function is None for function in functions):
-            parameters = {"capacity": capacity, "temperature": temperature}
             self.energy = make_bath_energy(
-                *(_check_positive(value, what, number, what == "capacity") for what, value in parameters.items())
+                _check_positive(capacity, "capacity", number, BATH_CAPACITY_CONDITION),
+                _check_positive(temperature, "temperature", number, BATH_TEMPERATURE_CONDITION),
             )
             return
         numbers = [1.0 if callable(T) else T for T in temperatures]
         C, T = (
-            _check_positive(capacity, "capacity", number, True),
-            _check_positive(numbers, "temperature", number, False),
+            _check_positive(capacity, "capacity", number, BATH_CAPACITY_CONDITION),
+            _check_positive(numbers, "temperature", number, BATH_TEMPERATURE_CONDITION),
         )
         for i in driven:
             if not is_traced(C) and np.isfinite(C[i]):
@@ -210,7 +212,7 @@ class _PositiveTemperature(Module):
         return jnp.where(T > 0.0, T, jnp.nan)
 
 
-def _check_positive(value, what: str, number: int, infinite: bool) -> jax.Array:
+def _check_positive(value, what: str, number: int, condition: Condition) -> jax.Array:
     # numbers stay numbers while JAX traces a family of systems
     evaluation = contextlib.nullcontext() if is_traced(value) else jax.ensure_compile_time_eval()
     with evaluation:
@@ -218,9 +220,7 @@ def _check_positive(value, what: str, number: int, infinite: bool) -> jax.Array:
         array = jnp.broadcast_to(array, (number,)) if array.ndim == 0 else array
     if array.shape != (number,):
         raise InputError(f"the {what} of {number} baths must be a number or have shape ({number},), got {array.shape}")
-    if not is_traced(array) and not all(a > 0.0 and (infinite or np.isfinite(a)) for a in array.tolist()):
-        allowed = "positive" if infinite else "positive and finite"
-        raise InputError(f"the {what} of a bath must be {allowed}, got {array.tolist()}")
+    condition.require(array)
     return array
 
 
