@@ -24,7 +24,7 @@ from ..functions.density import matrix_logarithm
 from ..functions.gradients import EPS
 from ..functions.time_span import required_argument_count
 from .base import Dissipation
-from .checks import checked_rate
+from .checks import RATE_CONDITION, checked_rate
 from .operators import (
     ENERGY_RTOL,
     Operator,
@@ -103,7 +103,7 @@ class ThermalJumps(Dissipation):
     """
 
     operators: tuple[Operator, ...] = eqx.field(static=True)
-    rates: tuple[Any, ...]
+    rates: tuple[Any, ...] = eqx.field(metadata=RATE_CONDITION.metadata)
     bath: int = eqx.field(static=True)
     jumps: tuple[Jump, ...] = eqx.field(static=True, repr=False)
     jump_frame: Operator | None = eqx.field(static=True, repr=False)

@@ -25,7 +25,7 @@ from ..systems.invariants import (
     random_test_states,
 )
 from ..tracing.trace_errors import TRACE_ERRORS
-from .named_parameters import parameter_conditions_by_leaf, require_parameter
+from .named_parameters import require_parameter
 from .preparation import prepare_system_and_method
 from .problem import Problem
 
@@ -82,13 +82,6 @@ class VariedParameters:
         self.entries = np.concatenate([self._leaves[i].ravel() for i in self._varied_leaves])
         slots = iter(self._split_by_leaf(self.entries))
         self._slots = [(parameter, [next(slots) for _ in parameter.leaf_indices]) for parameter in parameters]
-        conditions = parameter_conditions_by_leaf(system)
-        self._conditions = [
-            (conditions[i].test, slot)
-            for parameter, slots_of_leaves in self._slots
-            for i, slot in zip(parameter.leaf_indices, slots_of_leaves, strict=True)
-            if i in conditions
-        ]
         self._functions = tuple(
             name for name in candidate_invariants(system) if name not in invariants_by_construction(system)
         )
@@ -109,11 +102,11 @@ class VariedParameters:
             array = np.asarray(value, dtype=np.float64)
             if array.shape != parameter.value.shape:
                 return None
+            if parameter.condition is not None and not parameter.condition.holds(array):
+                return None
             leaf = parameter.to_stored_array(array)
             for slot in slots:
                 slot[...] = leaf
-        if not all(test(slot).all() for test, slot in self._conditions):
-            return None
         if self._test is not None:
             self._codes = self._test().min(axis=0).tolist()
             if not all(code in (0.0, CONSERVED_CODE) for code in self._codes):

@@ -17,6 +17,8 @@ from manifolds.structures.poisson import ProductPoisson
 
 from ..errors import InputError
 from ..functions.bath_energy import (
+    BATH_CAPACITY_CONDITION,
+    BATH_TEMPERATURE_CONDITION,
     BathEnergy,
     DrivenReservoirEnergy,
     ReservoirEnergy,
@@ -25,7 +27,7 @@ from ..functions.bath_energy import (
     make_bath_energy,
 )
 from ..functions.checks import traced_function_and_shape
-from ..functions.conditions import checked_numbers
+from ..functions.conditions import Condition, checked_numbers
 from ..functions.energy import Energy, Sum
 from ..functions.mechanics import Each
 from ..tracing.short_form import format_arguments
@@ -101,18 +103,15 @@ class HeatBaths(Module):
         temperatures = _entry_per_bath(temperature, "temperature", number)
         driven = [i for i, T in enumerate(temperatures) if callable(T) and functions[i] is None]
         if not driven and all(function is None for function in functions):
-            parameters = {"capacity": capacity, "temperature": temperature}
             self.energy = make_bath_energy(
-                *(
-                    _checked_positive_array(value, what, number, what == "capacity")
-                    for what, value in parameters.items()
-                )
+                _checked_positive_array(capacity, "capacity", number, BATH_CAPACITY_CONDITION),
+                _checked_positive_array(temperature, "temperature", number, BATH_TEMPERATURE_CONDITION),
             )
             return
         numbers = [1.0 if callable(T) else T for T in temperatures]
         C, T = (
-            _checked_positive_array(capacity, "capacity", number, True),
-            _checked_positive_array(numbers, "temperature", number, False),
+            _checked_positive_array(capacity, "capacity", number, BATH_CAPACITY_CONDITION),
+            _checked_positive_array(numbers, "temperature", number, BATH_TEMPERATURE_CONDITION),
         )
         for i in driven:
             if not is_traced(C) and np.isfinite(C[i]):
@@ -214,7 +213,7 @@ class _PositiveTemperature(Module):
         return jnp.where(T > 0.0, T, jnp.nan)
 
 
-def _checked_positive_array(value, what: str, n_baths: int, allow_infinite: bool) -> jax.Array:
+def _checked_positive_array(value, what: str, n_baths: int, condition: Condition) -> jax.Array:
     # numbers stay numbers while JAX traces a family of systems
     """Return one positive number per bath as an array, shape (n_baths,); InputError for other values."""
     evaluation = contextlib.nullcontext() if is_traced(value) else jax.ensure_compile_time_eval()
@@ -225,9 +224,7 @@ def _checked_positive_array(value, what: str, n_baths: int, allow_infinite: bool
         raise InputError(
             f"the {what} of {n_baths} baths must be a number or have shape ({n_baths},), got {array.shape}"
         )
-    if not is_traced(array) and not all(a > 0.0 and (allow_infinite or np.isfinite(a)) for a in array.tolist()):
-        requirement = "positive" if allow_infinite else "positive and finite"
-        raise InputError(f"the {what} of a bath must be {requirement}, got {array.tolist()}")
+    condition.require(array)
     return array
 
 

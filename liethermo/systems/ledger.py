@@ -20,7 +20,7 @@ from ..dissipation.base import LawName, SkewFriction
 from ..dissipation.checks import checked_semidefinite
 from ..errors import InputError
 from ..functions.checks import traced_function_and_shape
-from ..functions.conditions import checked_numbers, require_condition
+from ..functions.conditions import checked_numbers, require_condition, semidefinite_condition
 from ..functions.energy import Energy, Quadratic
 from ..functions.time_span import ConstantFunction, LastArgumentIgnored, required_argument_count
 from ..tracing.interpret import evaluate_at_points
@@ -246,7 +246,7 @@ class ForcesAndHeat(SkewFriction):
 class LinearFriction(Module):
     """The friction force ``-R v`` as a function of arguments that end with (v, S, t)."""
 
-    R: jax.Array
+    R: jax.Array = eqx.field(metadata=semidefinite_condition("friction", symmetric=False).metadata)
 
     def __call__(self, *parts):
         v = parts[-3]
