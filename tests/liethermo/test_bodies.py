@@ -264,6 +264,7 @@ def test_arrays_that_are_no_inertia(call, message):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_models_take_tensors():
     """A tensor gives the motion of its moments in other axes: rows of states are turned, energies are equal."""
     moments, mu = np.array([2.0, 2.5, 3.0]), np.array([0.1, 0.2, 1.0])

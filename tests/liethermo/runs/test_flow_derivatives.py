@@ -249,7 +249,7 @@ def test_all_states_of_a_path(build, order):
     assert np.abs(expected[-1]).max(axis=0).min() > 1e-3 if order == 1 else np.abs(expected[-1]).max() > 0.1
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("method", IMPLICIT, ids=str)
 def test_every_method(method):
     """Alone by the parameters, then by the state: what does not move is no direction."""
