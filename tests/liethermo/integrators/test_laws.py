@@ -74,7 +74,11 @@ def law_cases():
         yield pytest.param(g, case, method, id=f"{g.name}-{case.name}-{method}")
 
 
-@pytest.mark.sampled("so(3)-killing-MetriplecticRungeKutta(order=4)", "heisenberg(1)-potential_power_law-MetriplecticMidpoint(gradient=Gonzalez)", "se(2)-inner_product-MetriplecticMidpoint(gradient=MeanValue)")
+@pytest.mark.sampled(
+    "so(3)-killing-MetriplecticRungeKutta(order=4)",
+    "heisenberg(1)-potential_power_law-MetriplecticMidpoint(gradient=Gonzalez)",
+    "se(2)-inner_product-MetriplecticMidpoint(gradient=MeanValue)",
+)
 @pytest.mark.parametrize(("g", "case", "method"), list(law_cases()))
 def test_every_algebra_dissipation_and_method(g, case, method):
     system = build(g, case)

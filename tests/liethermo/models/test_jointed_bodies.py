@@ -413,7 +413,7 @@ def test_a_control_without_the_change_of_inertia_fails(reference):
     assert np.abs(run.y[3:, -1].reshape(3, 3) - reference[0]).max() > 0.1
 
 
-@pytest.mark.sampled("branches")
+@pytest.mark.slow
 @pytest.mark.parametrize("parents", [range(8), (0, 0, 1, 1, 3, 4, 4, 0)], ids=["chain", "branches"])
 def test_larger_trees_beside_derivatives_of_the_places_of_their_bodies(parents):
     """``M = sum m D r^T D r + D w^T J D w`` less the linear momentum, r and w of each body from link to link."""
@@ -456,7 +456,7 @@ def test_larger_trees_beside_derivatives_of_the_places_of_their_bodies(parents):
         inertias = np.stack([body[2] for body in bodies])
         return 0.5 * (masses @ jnp.sum(v**2, axis=1) + jnp.einsum("ni,nij,nj", omega, inertias, omega))
 
-    M = jax.jit(jax.hessian(kinetic_energy))(jnp.zeros(3 + len(parents)))
+    M = jax.hessian(kinetic_energy)(jnp.zeros(3 + len(parents)))
     np.testing.assert_allclose(tree.system().mass_matrix(q), M, atol=1e-13 * float(jnp.abs(M).max()))
 
 

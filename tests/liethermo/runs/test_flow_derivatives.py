@@ -19,9 +19,9 @@ METHODS = [m for m in lt.registered_methods() if isinstance(m, METRIPLECTIC_METH
 
 
 def methods_with(names) -> list:
-    """Return methods with names of systems: each method, and each class of methods with each system."""
+    """Return methods with names of systems: each method, and each system with a method of each kind."""
     cases = [pytest.param(method, name, id=f"{method}-{name}") for name in names for method in METHODS]
-    return covering(cases, lambda method, name: [(type(method), name), str(method)])
+    return covering(cases, lambda method, name: [(method.explicit, name), str(method)])
 
 
 def jacobian_by_differences(f, x, size=2e-3):
