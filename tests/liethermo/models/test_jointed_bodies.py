@@ -148,21 +148,6 @@ def test_a_rigid_body_has_no_joint_rates():
 # -- closed forms ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_two_bodies_on_a_hinge_through_their_centres_swing_with_the_reduced_inertia():
-    """Wheels on one axis with a torsion spring: ``omega^2 = k (1/J0 + 1/J1)``."""
-    J0, J1, k = 3.0, 0.5, 2.0
-    tree = lt.bodies.Tree()
-    tree.add("bus", 4.0, inertia=(2.0, 2.0, J0))
-    tree.add("rotor", 1.0, inertia=(0.4, 0.4, J1), parent="bus", joint=lt.bodies.Hinge((0, 0, 0), (0, 0, 2.0), k))
-    system = tree.system()
-    run = lt.integrate(system, system.state(joints={"rotor": 0.3}), (0.0, 4.0), 0.05, lt.MetriplecticGauss(4))
-    omega = np.sqrt(k * (1.0 / J0 + 1.0 / J1))
-    np.testing.assert_allclose(run.joints["rotor"], 0.3 * np.cos(omega * run.t), atol=1e-11)
-    angle = lt.bodies.euler_angles(run, "xyz")[:, 2]  # the bus turns back by J1 / (J0 + J1) of the joint angle
-    np.testing.assert_allclose(angle, J1 / (J0 + J1) * (0.3 - run.joints["rotor"]), atol=1e-11)
-
-
 def test_two_masses_on_a_slider_swing_with_the_reduced_mass():
     tree = lt.bodies.Tree()
     tree.add("bus", 4.0, inertia=(1.0, 1.0, 1.0))

@@ -274,19 +274,6 @@ def test_the_attitude_of_a_body_with_three_wheels_beside_an_integration_in_coord
     assert solution.audit().passed
 
 
-@pytest.mark.slow
-def test_a_body_with_wheels_moves_alike_with_and_without_its_attitude():
-    velocity = {"angular_velocity": RATES, "rotor_rates": [1.0, -2.0, 0.5]}
-    runs = []
-    for attitude in (False, True):
-        system = lt.models.body_with_wheels((3.0, 2.0, 1.5), (0.3, 0.2, 0.1), attitude=attitude)
-        runs.append(lt.integrate(system, system.state(**velocity), (0.0, END), STEP, lt.MetriplecticGauss(3)))
-    plain, followed = runs
-    assert np.abs(lt.bodies.angular_velocity(plain) - lt.bodies.angular_velocity(followed)).max() < ACCURACY
-    momentum = np.einsum("tij,tj->ti", followed.attitude, followed.x[:, :3])
-    assert np.abs(momentum - momentum[0]).max() < 1e-14
-
-
 def test_reaction_wheels_with_one_wheel_are_a_damper_wheel():
     one = lt.models.reaction_wheels((2.0, 1.6, 1.0), [[0.0, 1.0, 0.0]], 0.1, 0.05)
     other = lt.models.damper_wheel((2.0, 1.6, 1.0), (0.0, 1.0, 0.0), 0.1, 0.05)
@@ -384,14 +371,6 @@ def test_a_long_table_with_zeros_is_read_alike_by_both_engines():
     assert np.abs(ends[0] - ends[1]).max() < 1e-13
     _, omega, _ = reference(lambda t, g, omega: [np.interp(t, times, column) for column in moments.T], False)
     assert np.abs(ends[1] - INERTIA @ omega).max() < 1e-4  # kinks inside of steps
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", [lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4), lt.MetriplecticTaylor(8)])
-def test_engines_agree_on_tables(method):
-    torque = [T.Tabulated(SPLINE), T.ConstantInSpace([0.0, 0.1, 0.0])]
-    ends = [run(torque, False, method=method, engine=engine)[1].x[-1] for engine in ("array", "compiled")]
-    assert np.abs(ends[0] - ends[1]).max() < 1e-13
 
 
 def test_torque_of_the_time_alone():
