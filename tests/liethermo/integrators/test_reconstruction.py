@@ -467,6 +467,7 @@ def test_explicit_methods_turn_every_group_at_their_order(name, method):
     assert (slopes > method.order - 0.5).all(), (errors, slopes)
 
 
+@pytest.mark.slow
 def test_explicit_attitudes_in_every_kind_of_run():
     """Both engines, an ensemble and adaptive steps agree; the momenta are those without an attitude."""
     system, method, T = body(damped=True), lt.MetriplecticRungeKutta(8), 2.0

@@ -354,6 +354,7 @@ def test_consistency_is_judged_by_short_steps(method, is_consistent):
     assert is_consistent or row.value == pytest.approx(1e-3, rel=0.01)
 
 
+@pytest.mark.sampled("array-slow", "compiled-right")
 @pytest.mark.parametrize(
     ("method", "is_consistent"),
     [(lt.MetriplecticMidpoint(), True), (SlowedMidpoint(), False)],
@@ -386,6 +387,7 @@ class SlowedWithWeakFriction(lt.MetriplecticMidpoint):
         return factor * super().slopes(system, x, compensation, h, k)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("step", [0.1, lt.Adaptive(1e-6)], ids=["fixed", "adaptive"])
 @pytest.mark.parametrize("weakest_rate", [0.06, 0.04])
 def test_one_system_of_an_ensemble_that_the_method_does_not_follow(weakest_rate, step):

@@ -253,6 +253,7 @@ def test_the_two_orders():
     np.testing.assert_array_equal(spins_to_site_order(spins_to_component_order(np.stack([x, -x]), 4), 4), [x, -x])
 
 
+@pytest.mark.slow
 def test_control_a_wrong_order_is_seen():
     """Steps from a state in the other order, taken for one that is not."""
     system = ring()

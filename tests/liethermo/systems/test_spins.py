@@ -456,6 +456,7 @@ class Unsaid(lt.LandauLifshitz):
         return super().factor(system, x, dH, dL)._replace(spin_coefficients=None)
 
 
+@pytest.mark.slow
 def test_what_noise_turns_a_step_solves_for_at_once():
     """A step takes a fraction of the iterations of the control, where the spin that is turned farthest decides."""
     sites, bath = (4, 4, 4), lt.HeatBaths(np.inf, 1.4)
@@ -471,7 +472,7 @@ def test_what_noise_turns_a_step_solves_for_at_once():
     assert 2 * at_once.stats.fixed_point_iterations < control.stats.fixed_point_iterations
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled("0.02-False")
 @pytest.mark.parametrize(("step", "needs_newton"), [(0.02, False), (0.06, True)])
 def test_precession_and_damping_of_each_spin_are_solved_for_at_once(step, needs_newton):
     """The control takes a fifth more iterations in short steps, and Newton's method in long ones."""
