@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -38,7 +38,7 @@ from ..systems.kind_checks import require_system
 from ..tracing.programs import jit_cached, jit_unoptimised
 from .adaptive import Adaptive
 from .flow_derivatives import solve_with_implicit_derivative, state_derivatives
-from .named_parameters import replace_parameters
+from .named_parameters import checked_parameters, replace_parameters
 from .preparation import (
     checked_initial_state,
     checked_or_default_method,
@@ -64,12 +64,7 @@ def system_with_parameters(system_or_builder, parameters) -> System:
                 f"system must be a system, or a function of parameters=, got {type(system_or_builder).__name__}"
             )
         return system_or_builder(parameters)
-    if not isinstance(parameters, Mapping):
-        raise InputError(
-            "parameters of a system must be a dict by the names of its parameters. For parameters of another form, "
-            "give a function of them that builds the system"
-        )
-    return replace_parameters(system_or_builder, parameters)
+    return replace_parameters(system_or_builder, checked_parameters(parameters))
 
 
 def checked_save_times(save_at, schedule: StepSchedule) -> jax.Array | np.ndarray:

@@ -15,7 +15,7 @@ from manifolds._arrays import host_array, real_array
 
 from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
 from ..errors import InputError
-from ..functions.conditions import Condition, condition_of_field
+from ..functions.conditions import Condition, checked_numbers, condition_of_field
 from ..functions.energy import Quadratic
 from ..models.inertia import INERTIA_CONDITION, inverse_moments
 from ..systems import System
@@ -70,6 +70,16 @@ def named_parameters(system: System) -> dict[str, np.ndarray]:
     return {name: parameter.value for name, parameter in _parameters_by_name_and_by_path(system)[0].items()}
 
 
+def checked_parameters(parameters: Any) -> Mapping[str, Any]:
+    """Return ``parameters`` if it maps names to values; raise InputError otherwise."""
+    if not isinstance(parameters, Mapping):
+        raise InputError(
+            f"parameters of a system must be a dict from names to values, got {type(parameters).__name__}. For "
+            "parameters of another form, give a function of them that builds the system"
+        )
+    return parameters
+
+
 def replace_parameters(system: System, parameter_values: Mapping[str, Any]) -> System:
     """Return a copy of a system with new values, traced or not, of the named parameters.
 
@@ -84,7 +94,7 @@ def replace_parameters(system: System, parameter_values: Mapping[str, Any]) -> S
     names_by_leaf: dict[int, str] = {}
     for name, value in parameter_values.items():
         parameter = require_parameter(system, name)
-        array = host_array(real_array(value))
+        array = host_array(checked_numbers(value, name))
         if array.shape != parameter.value.shape:
             raise InputError(f"{name} must have shape {parameter.value.shape}, got {array.shape}")
         _record_name_of_leaves(names_by_leaf, name, parameter)
@@ -144,7 +154,7 @@ def stack_member_arrays(system: System, member_values: Mapping[str, Any]) -> lis
     leaves = [array[None] for array in parameter_arrays(system)]
     names_by_leaf: dict[int, str] = {}
     for name, value in member_values.items():
-        parameter, array = require_parameter(system, name), np.asarray(value, dtype=np.float64)
+        parameter, array = require_parameter(system, name), np.asarray(checked_numbers(value, name))
         if array.ndim == 0 or array.shape[1:] != parameter.value.shape:
             expected_shape = ", ".join(["trajectories", *map(str, parameter.value.shape)])
             raise InputError(f"the values of {name} must have shape ({expected_shape}), got {array.shape}")

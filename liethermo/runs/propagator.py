@@ -16,6 +16,7 @@ from manifolds._precision import with_library_settings
 from ..engines.select_engine import ENGINES
 from ..engines.status_codes import StatusCode
 from ..errors import ConvergenceError, FileError, InputError, NonFiniteError
+from ..functions.conditions import checked_numbers
 from ..functions.time_span import TIMES_OF_SMOOTH_FUNCTIONS, DeclaredTimes
 from ..integrators import OneStepMethod, Reference
 from ..results.ensemble import Ensemble
@@ -27,7 +28,7 @@ from ..tracing.scalarize import UnsupportedPrimitive
 from .adaptive import Adaptive
 from .ensemble import ensemble
 from .events import Until
-from .named_parameters import replace_parameters
+from .named_parameters import checked_parameters, replace_parameters
 from .noise import Fluctuations, check_noise
 from .preparation import (
     check_choice,
@@ -271,7 +272,9 @@ class Propagator(metaclass=ListedType):
             If the system has no parameter of this name, or a value has another shape or is refused by the constructor
             of its object, as a negative rate is.
         """
-        values = {name: np.asarray(value, dtype=np.float64) for name, value in parameters.items()}
+        values = {
+            name: np.asarray(checked_numbers(value, name)) for name, value in checked_parameters(parameters).items()
+        }
         key = tuple((name, value.shape, value.tobytes()) for name, value in sorted(values.items()))
         return self._variants.get_or_compute(
             key,
@@ -362,6 +365,8 @@ class Propagator(metaclass=ListedType):
         The result is None if new values may change what the system conserves; a new propagator then has to compute the
         state.
         """
+        if type(parameters) is not dict:  # the commonest type needs no check
+            checked_parameters(parameters)
         names, thread = tuple(parameters), self._thread
         if names not in thread.varied_parameters:
             self.with_parameters(parameters)  # which checks the names

@@ -16,13 +16,14 @@ from manifolds import ManifoldsError
 
 from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
 from ..errors import InputError, LiethermoError
+from ..functions.conditions import checked_numbers
 from ..models.inertia import are_inertia_tensors
 from ..systems import System
 from ..systems.kind_checks import require_system
 from ..tracing.caching import fingerprint
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.traced import TracedFunction, trace_function
-from .named_parameters import reasons_of_refused_members, require_parameter, stack_member_arrays
+from .named_parameters import checked_parameters, reasons_of_refused_members, require_parameter, stack_member_arrays
 
 MAX_CHECKED_MEMBERS = 8
 """Largest number of members that are built and checked one by one at a time."""
@@ -93,14 +94,9 @@ class Family:
             return cls(
                 ProgramStructure.from_module(system), [array[None] for array in parameter_arrays(system)], system
             )
-        if not isinstance(parameters, Mapping):
-            raise InputError(
-                "parameters of a system must be a dict from names to arrays. "
-                "For parameters of another form, give a function that builds the system"
-            )
-        for name, values in parameters.items():
+        for name, values in checked_parameters(parameters).items():
             has_moments = name.endswith("inertia") and require_parameter(system, name).value.shape == (3,)
-            if has_moments and are_inertia_tensors(np.asarray(values, dtype=np.float64)):
+            if has_moments and are_inertia_tensors(np.asarray(checked_numbers(values, name))):
                 raise InputError(
                     f"the values of {name} are the tensor of inertia of one body, but three sets of principal moments "
                     "are expected. Give the moments of each trajectory as a row, or a system with a tensor"

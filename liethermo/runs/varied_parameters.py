@@ -99,7 +99,10 @@ class VariedParameters:
         conservation is inconclusive.
         """
         for (parameter, slots), value in zip(self._slots, parameter_values, strict=True):
-            array = np.asarray(value, dtype=np.float64)
+            try:
+                array = np.asarray(value, dtype=np.float64)
+            except (TypeError, ValueError):  # which a new propagator reports
+                return None
             if array.shape != parameter.value.shape:
                 return None
             if parameter.condition is not None and not parameter.condition.holds(array):

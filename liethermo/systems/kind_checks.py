@@ -35,7 +35,8 @@ def require_system(value: Any, error_prefix: str) -> System:
     InputError
     """
     if not isinstance(value, System):
-        raise InputError(f"{error_prefix}, got {type(value).__name__}")
+        description = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+        raise InputError(f"{error_prefix}, got {description}")
     return value
 
 

@@ -83,6 +83,7 @@ def uniaxial_anisotropy(sites, coefficients: Mapping, axis=(0.0, 0.0, 1.0)) -> E
     InputError
     """
     shape = lattice_shape(sites)
+    _require_mapping(coefficients, "the coefficients of a uniaxial anisotropy", "{2: 0.5}")
     if any(isinstance(p, bool) or not isinstance(p, int | np.integer) or p < 1 for p in coefficients):
         raise InputError(f"the powers of a uniaxial anisotropy must be positive integers, got {list(coefficients)}")
     n = checked_site_values(axis, shape, (3,), "an axis")
@@ -146,9 +147,11 @@ def stevens_anisotropy(sites, coefficients: Mapping, axes=None) -> Energy:
     InputError
     """
     terms: dict[tuple[int, int, int], jax.Array] = {}
-    for (k, q), B in coefficients.items():
+    _require_mapping(coefficients, "the coefficients of Stevens functions", "{(2, 0): 0.5}")
+    for pair, B in coefficients.items():
+        k, q = pair if isinstance(pair, tuple) and len(pair) == 2 else (None, None)
         if k not in STEVENS_FACTORS or not isinstance(q, int | np.integer) or abs(q) > k:
-            raise InputError(f"the Stevens function ({k}, {q}) must have k = 2, 4 or 6 and |q| <= k")
+            raise InputError(f"a Stevens function needs a pair (k, q) with k = 2, 4 or 6 and |q| <= k, got {pair}")
         value = checked_numbers(B, "a Stevens coefficient")
         for powers, factor in stevens_monomials(int(k), int(q)).items():
             terms[powers] = terms.get(powers, 0.0) + factor * value
@@ -182,6 +185,7 @@ def polynomial_anisotropy(sites, terms: Mapping, axes=None) -> Energy:
     0.1152
     """
     shape = lattice_shape(sites)
+    _require_mapping(terms, "the terms of an anisotropy", "{(2, 2, 0): 0.5}")
     powers = list(terms)
     if not powers or not all(_is_power_triple(p) for p in powers):
         raise InputError(f"an anisotropy needs powers (p1, p2, p3) of non-negative integers, got {powers}")
@@ -190,6 +194,12 @@ def polynomial_anisotropy(sites, terms: Mapping, axes=None) -> Energy:
     if frame is not None and frame.shape not in ((3, 3), (*shape, 3, 3)):
         raise InputError(f"the axes of an anisotropy must have shape (3, 3) or {(*shape, 3, 3)}, got {frame.shape}")
     return SitePolynomial(shape, tuple((int(a), int(b), int(c)) for a, b, c in powers), values, frame)
+
+
+def _require_mapping(value, what: str, example: str) -> None:
+    """Raise InputError if a value is not a mapping; the message has an example of one."""
+    if not isinstance(value, Mapping):
+        raise InputError(f"{what} must be a dict such as {example}, got {type(value).__name__}")
 
 
 def _is_power_triple(powers) -> bool:

@@ -216,7 +216,7 @@ def test_what_cannot_be_compiled():
         ({"system": lt.models.rigid_body}, "needs parameters"),
         ({"parameters": {"rate": np.ones(2)}}, r"no parameter 'rate'; its parameters are .*dissipation\.rate"),
         ({"parameters": {"dissipation.rate": np.ones((2, 2))}}, r"have shape \(trajectories\), got \(2, 2\)"),
-        ({"parameters": np.ones(2)}, "a dict from names to arrays"),
+        ({"parameters": np.ones(2)}, "a dict from names to values"),
         ({"parameters": {"dissipation.rate": np.ones(2)}, "x0s": np.ones((3, 3))}, r"different numbers .*\[2, 3\]"),
         ({"parameters": {"dissipation.rate": -np.ones(3)}}, "no trajectory can be started; trajectory 0"),
         ({"save_at": [0.5], "outputs": "final"}, 'save_at needs outputs="trajectory"'),
