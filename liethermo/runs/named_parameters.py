@@ -15,7 +15,7 @@ from manifolds._arrays import host_array, real_array
 
 from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
 from ..errors import InputError
-from ..functions.conditions import Condition, condition_of_field
+from ..functions.conditions import ParameterCondition, condition_of_field
 from ..functions.energy import Quadratic
 from ..models.inertia import INERTIA_CONDITION, inverse_moments
 from ..systems import System
@@ -38,14 +38,14 @@ class NamedParameter(NamedTuple):
         Numbers of the arrays of the system that hold it, in the order of :func:`parameter_arrays`.
     is_inverse : bool
         Whether these arrays hold the inverse: those of an energy with moments of inertia do.
-    condition : Condition or None
+    condition : ParameterCondition or None
         The condition of the constructor on the value.
     """
 
     value: np.ndarray
     leaves: tuple[int, ...]
     is_inverse: bool = False
-    condition: Condition | None = None
+    condition: ParameterCondition | None = None
 
     def to_leaf(self, value):
         """Convert a value of the parameter, or several along the first axis, to the array that the system stores.
@@ -113,7 +113,7 @@ def refused_members(system: System, values: Mapping[str, Any]) -> dict[int, str]
     return reasons
 
 
-def _condition_at(system: System, path: Sequence[Any]) -> Condition | None:
+def _condition_at(system: System, path: Sequence[Any]) -> ParameterCondition | None:
     """Return the condition of the field of a system that holds the array at a path; None if it has none."""
     ends = [i for i, key in enumerate(path) if isinstance(key, GetAttrKey)]
     return condition_of_field(_node_at(system, path[: ends[-1]]), path[ends[-1]].name) if ends else None
