@@ -128,6 +128,7 @@ def test_terminal_events_end_the_run_at_their_zeros(terminal):
     assert np.array_equal(ours.sol(ours.t[-1]), ours.y[:, -1])
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("terminal", [False, True])
 def test_events_at_both_ends(terminal):
     """Zeros exactly at the end or at the start count as in SciPy, and an end of a step counts once."""
@@ -174,6 +175,7 @@ def test_events_in_the_first_step_of_a_driven_system(direction):
     assert_same_events(theirs, ours, 1e-6)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "events", [lambda t, y: y[1] * 0.0, lambda t, y: min(t - 1.0, 0.0) if t else 0.0], ids=["zero", "nearly"]
 )

@@ -63,7 +63,7 @@ def test_members_are_as_if_alone(method):
     assert ensemble[0].audit().passed
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [lt.MetriplecticMidpoint(), lt.MetriplecticRungeKutta(6)], ids=str)
 def test_adaptive_steps_and_saved_times(method):
     options = {"parameters": {"a": A}, "save_at": [0.5, 2.0]}
@@ -114,6 +114,7 @@ def test_a_flow_under_vmap(method):
     assert np.abs(jax.jit(jax.vmap(end))(jnp.asarray(A)) - single_flows).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_a_control_one_verdict_for_all_is_found(monkeypatch):
     """Control: with what the first member conserves held for all, the relation of company fails."""
 
@@ -235,10 +236,10 @@ def test_an_interruption_stops_all_groups(monkeypatch):
     from liethermo.runs.ensemble_lanes import FixedEnsembleRun
 
     def count_call(run):
-        calls.append(len(run.record.x0))
+        calls.append(len(run.group.x0))
 
     calls: list[int] = []
-    monkeypatch.setattr(FixedEnsembleRun, "run_compiled", count_call)
+    monkeypatch.setattr(FixedEnsembleRun, "run_on_compiled_engine", count_call)
     ensemble = lt.ensemble(body, START, SPAN, STEP, parameters={"a": A}, engine="compiled")
     assert calls == [1]
     assert ensemble.status.tolist() == [StatusCode.INTERRUPTED] * 3
