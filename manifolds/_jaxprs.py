@@ -14,7 +14,7 @@ CALL_PRIMITIVES = frozenset(
 UNKNOWN_ORIGIN = "of unknown origin"
 """Source line of an equation that JAX does not trace back to the user's code."""
 
-LIBRARY_FOLDERS = {Path(__file__).parent}
+PACKAGE_FOLDERS = {Path(__file__).parent}
 """Folders with code that is not the user's, beside those of JAX and equinox; a package on top of this one adds its
 own."""
 
@@ -30,7 +30,7 @@ def user_source_line(eqn) -> str:
 
 def is_user_file(path: Path) -> bool:
     """Return whether a file is the user's, and not part of a library, JAX or equinox."""
-    return not {"jax", "jaxlib", "equinox"} & set(path.parts) and not any(map(path.is_relative_to, LIBRARY_FOLDERS))
+    return not {"jax", "jaxlib", "equinox"} & set(path.parts) and not any(map(path.is_relative_to, PACKAGE_FOLDERS))
 
 
 def broadcast(x, params):

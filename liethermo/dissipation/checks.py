@@ -11,14 +11,14 @@ from manifolds.matrices.linear import BlockDiagonal, Diagonal
 
 from ..errors import IndefiniteError, InputError
 from ..functions.checks import traced_function_and_shape
-from ..functions.conditions import Condition, checked_numbers, require_condition
+from ..functions.conditions import ParameterCondition, checked_numbers, require_condition
 from ..functions.indices import Indices
 from .geometry import Geometry
 
 NEGATIVE_RATE_MESSAGE = "a dissipation rate must be >= 0, got {value}: a negative rate would lower the entropy"
 """Message for a rate that is negative or NaN."""
 
-RATE_CONDITION = Condition(lambda rate: rate >= 0.0, NEGATIVE_RATE_MESSAGE)
+RATE_CONDITION = ParameterCondition(lambda rate: rate >= 0.0, NEGATIVE_RATE_MESSAGE)
 """Condition on the rate, or the rates, of a dissipation."""
 
 NEGATIVE_EIGENVALUE_MESSAGE = (

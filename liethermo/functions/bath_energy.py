@@ -14,15 +14,15 @@ import scipy
 from manifolds._arrays import is_traced
 
 from ..errors import InputError
-from .conditions import Condition
+from .conditions import ParameterCondition
 from .energy import Energy, Linear, Pullback, SpanLimitedEnergy, StateTimeEnergy
 from .frames import sum_terms
 from .indices import Components, pattern_of_matrix, sparsity_pattern
 from .path import CollocationPath
 from .time_span import TimeSpan
 
-BATH_CAPACITY_CONDITION = Condition(lambda a: a > 0.0, "the capacity of a bath must be positive, got {value}")
-BATH_TEMPERATURE_CONDITION = Condition(
+BATH_CAPACITY_CONDITION = ParameterCondition(lambda a: a > 0.0, "the capacity of a bath must be positive, got {value}")
+BATH_TEMPERATURE_CONDITION = ParameterCondition(
     lambda a: (a > 0.0) & (a < np.inf), "the temperature of a bath must be positive and finite, got {value}"
 )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import contextvars
+import dataclasses
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from manifolds._arrays import is_traced, real_array
 from ..errors import InputError
 
 
-class Condition(NamedTuple):
+class ParameterCondition(NamedTuple):
     """A condition on a parameter, for the constructor of its object and for values that are given by name later.
 
     Attributes
@@ -36,7 +37,7 @@ class Condition(NamedTuple):
     matrix_template: str = ""
 
     @property
-    def metadata(self) -> dict[str, Condition]:
+    def metadata(self) -> dict[str, ParameterCondition]:
         """Metadata of a field of a module, ``eqx.field(metadata=condition.metadata)``, whose values given by name have
         to meet the condition."""
         return {"condition": self}
@@ -63,23 +64,23 @@ class Condition(NamedTuple):
         return self.test, self.template
 
 
-def positive_condition(name: str) -> Condition:
+def positive_condition(name: str) -> ParameterCondition:
     """Return the condition that numbers are positive and finite."""
-    return Condition(lambda a: (a > 0.0) & (a < np.inf), name + " must be positive and finite, got {value}")
+    return ParameterCondition(lambda a: (a > 0.0) & (a < np.inf), name + " must be positive and finite, got {value}")
 
 
-def nonnegative_condition(name: str) -> Condition:
+def nonnegative_condition(name: str) -> ParameterCondition:
     """Return the condition that numbers are zero or positive, and finite."""
-    return Condition(lambda a: (a >= 0.0) & (a < np.inf), name + " must be >= 0 and finite, got {value}")
+    return ParameterCondition(lambda a: (a >= 0.0) & (a < np.inf), name + " must be >= 0 and finite, got {value}")
 
 
-def semidefinite_condition(name: str, symmetric: bool = True) -> Condition:
+def semidefinite_condition(name: str, symmetric: bool = True) -> ParameterCondition:
     """Return the condition that the entries of a diagonal are >= 0, or that a matrix is positive semidefinite.
 
     Without ``symmetric`` only its symmetric part has to be semidefinite.
     """
     matrix_text = "symmetric and positive semidefinite" if symmetric else "positive semidefinite"
-    return Condition(
+    return ParameterCondition(
         lambda a: (a >= 0.0) & (a < np.inf),
         name + " must be >= 0 and finite, got {value}",
         _are_symmetric_and_semidefinite if symmetric else _are_semidefinite,
@@ -99,10 +100,10 @@ def _are_semidefinite(matrices):
     return eigenvalues[..., 0] >= -1e-12 * matrices.shape[-1] * xp.abs(matrices).max(axis=(-2, -1))
 
 
-def condition_of_field(owner: Any, name: str) -> Condition | None:
+def condition_of_field(owner: Any, name: str) -> ParameterCondition | None:
     """Return the condition of a field of a module; None if it has none."""
-    field = getattr(type(owner), "__dataclass_fields__", {}).get(name)
-    return None if field is None else field.metadata.get("condition")
+    fields = dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ()
+    return next((field.metadata.get("condition") for field in fields if field.name == name), None)
 
 
 class TracedCondition(NamedTuple):

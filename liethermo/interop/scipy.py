@@ -16,11 +16,17 @@ from ..errors import InputError
 from ..integrators import MetriplecticRungeKutta, OneStepMethod
 from ..results.solution import Solution
 from ..runs.adaptive import Adaptive
-from ..runs.events import EventSpecification, direction_attribute_of_event, terminal_attribute_of_event
+from ..runs.events import (
+    EventSpecification,
+    check_result_is_scalar,
+    direction_attribute_of_event,
+    terminal_attribute_of_event,
+)
 from ..runs.integrate import integrate, solution_without_steps
 from ..runs.schedule import backward_span_message, clip_times_to_span
 from ..systems import System
 from ..systems.kind_checks import require_system
+from ..tracing.short_form import callable_name
 
 __all__ = ["OdeResult", "solve_ivp"]
 __dir__ = public_dir(__all__)
@@ -230,14 +236,21 @@ def _has_event_at_start(
     direction."""
     (start, end), x = span, np.asarray(system.state(x0)).reshape(np.shape(x0))
     direction = direction_attribute_of_event(event_function)
-    if float(event_function(start, x, *arguments)) != 0.0:
+    if _event_value(event_function, start, x, arguments) != 0.0:
         return False
     if direction == 0 or end == start:
         return True
     max_length = FIRST_STRETCH * (end - start) if math.isfinite(end) else 1.0
     length = min(max_length, step.first or math.inf, step.largest or math.inf)
     short_run = integrate(system, x0, (start, start + length), step, method, on_failure="return", progress=False)
-    return direction * float(event_function(short_run.t[-1], short_run.x[-1], *arguments)) >= 0.0
+    return direction * _event_value(event_function, short_run.t[-1], short_run.x[-1], arguments) >= 0.0
+
+
+def _event_value(event_function: Callable, t: float, x: np.ndarray, arguments: tuple) -> float:
+    """Return the value of an event function; FunctionError unless it is one number."""
+    value = event_function(t, x, *arguments)
+    check_result_is_scalar(None if value is None else np.asarray(value), f"the event {callable_name(event_function)}")
+    return float(value)
 
 
 def _is_terminal_at_start(event_function: Callable, has_initial_event: bool) -> bool:

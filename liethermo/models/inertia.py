@@ -12,7 +12,7 @@ from manifolds._arrays import host_array, is_traced, real_array
 from manifolds.errors import warn
 
 from ..errors import InputError
-from ..functions.conditions import Condition, checked_numbers, require_condition
+from ..functions.conditions import ParameterCondition, checked_numbers, require_condition
 
 SYMMETRY_RTOL = 1e-9
 """Largest asymmetry of a tensor of inertia, relative to its largest entry."""
@@ -141,7 +141,7 @@ def _are_tensors_of_bodies(tensors):
     return is_symmetric & (xp.linalg.eigvalsh(tensors)[..., 0] > 0.0)
 
 
-INERTIA_CONDITION = Condition(
+INERTIA_CONDITION = ParameterCondition(
     _are_positive_or_of_rods,
     POSITIVE_MOMENTS_TEXT,
     _are_tensors_of_bodies,

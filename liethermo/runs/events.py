@@ -279,7 +279,7 @@ def _trace_event_function(
         except TRACE_ERRORS as error:
             failure = failure or error
         else:
-            _check_result_is_scalar(value, event_name)
+            check_result_is_scalar(value, event_name)
             return EventFunction(traced_function, names)
     assert failure is not None
     arguments = [np.asarray(a) for a in event_arguments(names, system, start_time, jnp.asarray(initial_state))]
@@ -291,11 +291,12 @@ def _trace_event_function(
         raise FunctionError(trace_error_message(description, failure)) from error
     if result is None:
         raise FunctionError(trace_error_message(f"{event_name} could not be evaluated", failure))
-    _check_result_is_scalar(number, event_name)
+    check_result_is_scalar(number, event_name)
     return EventFunction(PythonCall(call), names)
 
 
-def _check_result_is_scalar(result, function_name: str) -> None:
+def check_result_is_scalar(result, function_name: str) -> None:
+    """Raise FunctionError unless the result of a function is an array of shape ()."""
     shape = getattr(result, "shape", None)
     if shape != ():
         description = type(result).__name__ if shape is None else f"shape {shape}"

@@ -15,7 +15,7 @@ from manifolds._arrays import host_array, real_array
 
 from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
 from ..errors import InputError
-from ..functions.conditions import Condition, checked_numbers, condition_of_field
+from ..functions.conditions import ParameterCondition, checked_numbers, condition_of_field
 from ..functions.energy import Quadratic
 from ..models.inertia import INERTIA_CONDITION, inverse_moments
 from ..systems import System
@@ -38,14 +38,14 @@ class NamedParameter(NamedTuple):
         Numbers of the arrays of the system that hold the parameter, in the order of :func:`parameter_arrays`.
     is_inverse : bool
         Whether these arrays hold the inverse: those of an energy with moments of inertia do.
-    condition : Condition or None
+    condition : ParameterCondition or None
         The condition of the constructor on the value.
     """
 
     value: np.ndarray
     leaf_indices: tuple[int, ...]
     is_inverse: bool = False
-    condition: Condition | None = None
+    condition: ParameterCondition | None = None
 
     def to_stored_array(self, value):
         """Return the array that the system stores for a value of the parameter, or for several along the first axis.
@@ -123,7 +123,7 @@ def reasons_of_refused_members(system: System, parameter_values: Mapping[str, An
     return reasons
 
 
-def _condition_at(system: System, path: Sequence[Any]) -> Condition | None:
+def _condition_at(system: System, path: Sequence[Any]) -> ParameterCondition | None:
     """Return the condition of the field of a system that holds the array at a path; None if it has none."""
     ends = [i for i, key in enumerate(path) if isinstance(key, GetAttrKey)]
     return condition_of_field(_node_at(system, path[: ends[-1]]), path[ends[-1]].name) if ends else None

@@ -263,14 +263,11 @@ def final_status(engine: EngineWithFallback, state, t: float, h: float, interrup
         text = f"{step_text}, could not be taken: {reason}. Try a smaller step, where the motion itself stays inside"
         return Status(StatusCode.NON_FINITE, text, step, t, residual)
     shorter_step = _step_size_that_succeeds(engine, state, h)
-    advice = (
-        "Check the domain of your functions along the trajectory, or try a smaller step"
-        if shorter_step is None
-        else f"Try a smaller step, for example {shorter_step:g}"
-    )
+    example = "" if shorter_step is None else f", for example {shorter_step:g}"
     message = (
         f"NaN or infinity in {step_text}: the energy, the entropy or the vector field is not finite there "
-        f"({_reason_of_non_finite_step(engine, state, h)}). {advice}"
+        f"({_reason_of_non_finite_step(engine, state, h)}). Check the domain of your functions along the trajectory, "
+        f"or try a smaller step{example}"
     )
     return Status(StatusCode.NON_FINITE, message, step, t, residual)
 

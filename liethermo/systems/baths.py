@@ -27,7 +27,7 @@ from ..functions.bath_energy import (
     make_bath_energy,
 )
 from ..functions.checks import traced_function_and_shape
-from ..functions.conditions import Condition, checked_numbers
+from ..functions.conditions import ParameterCondition, checked_numbers
 from ..functions.energy import Energy, Sum
 from ..functions.mechanics import Each
 from ..tracing.short_form import format_arguments
@@ -213,7 +213,7 @@ class _PositiveTemperature(Module):
         return jnp.where(T > 0.0, T, jnp.nan)
 
 
-def _checked_positive_array(value, what: str, n_baths: int, condition: Condition) -> jax.Array:
+def _checked_positive_array(value, what: str, n_baths: int, condition: ParameterCondition) -> jax.Array:
     # numbers stay numbers while JAX traces a family of systems
     """Return one positive number per bath as an array, shape (n_baths,); InputError for other values."""
     evaluation = contextlib.nullcontext() if is_traced(value) else jax.ensure_compile_time_eval()

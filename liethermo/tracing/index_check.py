@@ -11,11 +11,11 @@ from jax.extend.core import ClosedJaxpr
 
 import manifolds.errors
 from manifolds import _index_check
-from manifolds._jaxprs import LIBRARY_FOLDERS
+from manifolds._jaxprs import PACKAGE_FOLDERS
 
 from ..errors import IndexOutOfRangeError
 
-LIBRARY_FOLDERS.add(Path(__file__).parents[1])
+PACKAGE_FOLDERS.add(Path(__file__).parents[1])
 
 
 def check_indices(closed_jaxpr: ClosedJaxpr) -> None:

@@ -234,13 +234,7 @@ class Space(SpaceMaps):
 
     def exp(self, x, v) -> jax.Array:
         """Return the point at time 1 of the geodesic from x with velocity v, shape ``(..., *shape)``: Riemannian
-        exponential.
-
-        Raises
-        ------
-        DomainError
-            If the point, or its computation, exceeds the range of double precision.
-        """
+        exponential. DomainError if it exceeds the range of double precision."""
         x, v = self._checked_point_and_vectors(x, v=v)
         y = self._call_compiled("_exp", x, v)
         if (index := first_nonfinite_index(y, len(self.shape))) is not None:

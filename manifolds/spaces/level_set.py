@@ -79,23 +79,14 @@ class LevelSet(Space):
         for field, value in (("sizes", sizes), ("name", name)):
             object.__setattr__(self, field, value)
         labels = [f"constraint {i}" for i in range(len(functions))] if len(functions) > 1 else ["constraints"]
-        frozen = tuple(map(self._frozen_function, functions, labels))
+        frozen = tuple(_frozen_function(self, *pair) for pair in zip(functions, labels, strict=True))
         object.__setattr__(self, "constraints", frozen)
         if callable(metric):
-            metric = self._frozen_function(metric, "metric")
+            metric = _frozen_function(self, metric, "metric")
         object.__setattr__(
             self, "form", metric if metric is None or callable(metric) else _ConstantMetric.from_matrix(metric, self)
         )
         self._check_constraints()
-
-    def _frozen_function(self, function: Callable, label: str) -> FrozenFunction:
-        """Return a function of the user as one that was traced for the shape of a point."""
-        try:
-            return FrozenFunction(function, self.sizes)
-        except IndexOutOfRangeError as error:
-            raise SpaceError(str(error.with_function(f"{self.name}: the function {label}"))) from None
-        except (TypeError, ValueError, IndexError, AttributeError) as error:
-            raise SpaceError(f"{self.name}: {label} must take an array of shape {self.sizes}: {error}") from None
 
     def _check_constraints(self) -> None:
         """Raise an error unless the constraints define a manifold and the metric has the right shape."""
@@ -253,6 +244,16 @@ class LevelSet(Space):
         ):
             return "the gradients of its constraints depend on each other there"
         return super()._why_off_space(x, residual)
+
+
+def _frozen_function(space: LevelSet, function: Callable, label: str) -> FrozenFunction:
+    """Return a function of the user, traced for the shape of the points of a space; SpaceError if it cannot be used."""
+    try:
+        return FrozenFunction(function, space.sizes)
+    except IndexOutOfRangeError as error:
+        raise SpaceError(str(error.with_function(f"{space.name}: the function {label}"))) from None
+    except (TypeError, ValueError, IndexError, AttributeError) as error:
+        raise SpaceError(f"{space.name}: {label} must take an array of shape {space.sizes}: {error}") from None
 
 
 @dataclass(frozen=True)

@@ -111,7 +111,7 @@ class CompiledLoops:
             if not self._loaded:
                 self._append_loop_functions(MachineCode(self._write_module, skip_optimisation, self._key))
             elif not skip_optimisation and self._loaded[-1][0].skip_optimisation:
-                self._append_loop_functions(self._loaded[-1][0].optimised())
+                self._append_loop_functions(self._loaded[-1][0].compile_optimised())
             return self._loaded[-1][1:]
 
     def _append_loop_functions(self, machine_code: MachineCode) -> None:

@@ -61,7 +61,7 @@ class MachineCode:
             self._engine.add_object_file(object_file)
             self._engine.finalize_object()
 
-    def optimised(self) -> MachineCode:
+    def compile_optimised(self) -> MachineCode:
         """Return optimised machine code of the same module."""
         return MachineCode(self._module_text, key=self._key)
 

@@ -266,11 +266,13 @@ def test_a_failure_is_told_as_scipy_tells_it():
         ({"args": (1.0,)}, "args are passed to the events, but there are none"),
         ({"args": 1.0, "events": crossing_event}, r"Write args=\(1.0,\)"),
         ({"events": _event(crossing_event, terminal=-1)}, "terminal must be True or the number"),
+        ({"events": lambda t, y: y[:2]}, r"must return one number, got shape \(2,\)\. For several events, give a list"),
+        ({"events": [crossing_event, lambda t, y: None]}, "must return one number, got NoneType"),
         ({"jac": None}, "leave out jac: the methods take it from the system"),
         ({"rtoll": 1e-6}, "leave out rtoll: solve_ivp has no such option"),
         ({"max_step": -1.0}, "largest step"),
     ],
 )
 def test_invalid_arguments_are_refused(arguments, message):
-    with pytest.raises(lt.InputError, match=message):
+    with pytest.raises((lt.InputError, lt.FunctionError), match=message):
         lt.scipy.solve_ivp(**({"fun": BODY, "t_span": SPAN, "y0": X0} | arguments))
