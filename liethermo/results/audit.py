@@ -195,6 +195,7 @@ class Audit(Tabular):
 
     @property
     def _verdict_on_run(self) -> str:
+        """Summary of the rows that judge the run, without those that judge the validity of the model."""
         violated_rows = {row.law for row in self.rows if row.passed is False and not row.concerns_model}
         if violated_rows - {ACCURACY_ROW, CONSISTENCY_ROW, STEPS_TAKEN_ROW, FAILED_TRAJECTORIES_ROW}:
             return LAW_FAILURE_VERDICT

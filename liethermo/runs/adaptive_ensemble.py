@@ -170,6 +170,7 @@ class _BatchRecorder:
             self._record_final_fields(indices, np.full(indices.size, StatusCode.INTERRUPTED))
 
     def _record_final_fields(self, indices: np.ndarray, status_codes: np.ndarray) -> None:
+        """Record the outcome of the trajectories with these indices in the batch."""
         runs, members = self.runs, self.members[indices]
         initial = {name: values[indices] for name, values in self.initial.items()}
         final = {name: runs.read(name, indices) for name in REPORTED_FIELDS}

@@ -183,6 +183,7 @@ class FixedEnsembleRun(EnsembleRun):
         record, group, first_save = self.record, self.group, 1
 
         def record_call(engine_call: EngineCall, first_step: int, saved_states: np.ndarray) -> bool:
+            """Store the saved states of an engine call; return False if the user has interrupted the run."""
             nonlocal first_save
             if engine_call.are_states_saved:
                 record.store_consecutive_saves(members, first_save, saved_states)

@@ -456,6 +456,7 @@ class RunEvidenceSource:
 
     @functools.cached_property
     def _evidence(self) -> Evidence:
+        """Evidence of the run, computed at its first use."""
         functions = {**energy_and_entropy_by_name(self.system), **self.functions}
         sample_indices = evenly_spaced_indices(len(self.saved_states), MAX_SENSITIVITY_STATES)
         sampled_x, guarantees = self.saved_states[sample_indices], frozenset(self.method.preserves)

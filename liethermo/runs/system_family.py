@@ -89,6 +89,7 @@ class Family:
 
     @classmethod
     def _from_named_parameters(cls, system: System, parameters) -> Family:
+        """Return the family of a system with values of named parameters for each member; None means one member."""
         if parameters is None:
             return cls(
                 ProgramStructure.from_module(system), [array[None] for array in parameter_arrays(system)], system
@@ -226,6 +227,7 @@ class Family:
         return list(zip(self.parameter_arrays, self.has_member_axis, strict=True))
 
     def member(self, member_index: int) -> System:
+        """Return one member as a system."""
         return (
             self.program_structure.rebuild(self.member_arrays(member_index))
             if self.common_system is None
