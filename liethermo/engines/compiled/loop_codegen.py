@@ -46,16 +46,15 @@ class BlockLayout:
         self.first_rows, self.n_rows = dict(zip(self.row_counts, ends, strict=False)), ends[-1]
 
 
-def compile_step_loop(
+def write_step_loop(
     programs: Mapping[str, NamedProgram],
     layout: BlockLayout,
     state_names: Sequence[str],
     is_per_trajectory: np.ndarray,
     lanes: int,
     saved_names: Sequence[str],
-    skip_optimisation: bool,
-) -> MachineCode:
-    """Compile the functions ``advance`` and ``begin`` of :class:`_StepLoopWriter` to machine code.
+) -> ir.Module:
+    """Write the functions ``advance`` and ``begin`` of :class:`_StepLoopWriter` for LLVM.
 
     Parameters
     ----------
@@ -69,8 +68,6 @@ def compile_step_loop(
         Parameters that lie in the block, under the name "p"; the others are common to all trajectories.
     saved_names : sequence of str
         Arrays that are written out at each save.
-    skip_optimisation : bool
-        See :class:`.machine_code.MachineCode`.
     """
     module = ir.Module("steps")
     function = ir.Function(module, ADVANCE_TYPE, "advance")
@@ -78,21 +75,23 @@ def compile_step_loop(
     _StepLoopWriter(function, programs, layout, state_names, is_per_trajectory, lanes, saved_names).write_loops()
     begin = ir.Function(module, BEGIN_TYPE, "begin")
     _StepLoopWriter(begin, programs, layout, state_names, is_per_trajectory, lanes, saved_names).write_start_function()
-    return MachineCode(module, skip_optimisation)
+    return module
 
 
 class CompiledLoops:
-    """Compiled functions of :func:`compile_step_loop`, optimised only once many steps are taken.
+    """Compiled functions of :func:`write_step_loop`, optimised only once many steps are taken.
 
     Parameters
     ----------
-    compile_loops : function from ``skip_optimisation`` to MachineCode
+    write_module : function that returns the module of :func:`write_step_loop`
+    key : str
+        See :class:`.machine_code.MachineCode`.
     can_skip_optimisation : bool
         Whether code may stay unoptimised: such code takes a place on the stack for each of its operations.
     """
 
-    def __init__(self, compile_loops: Callable[[bool], MachineCode], can_skip_optimisation: bool):
-        self._compile = compile_loops
+    def __init__(self, write_module: Callable[[], ir.Module], key: str, can_skip_optimisation: bool):
+        self._write_module, self._key = write_module, key
         self._can_skip_optimisation = can_skip_optimisation
         self._steps_so_far = 0
         self._lock = threading.Lock()
@@ -110,9 +109,9 @@ class CompiledLoops:
                 self._can_skip_optimisation and self._steps_so_far + planned_steps <= MAX_UNOPTIMISED_STEPS
             )
             if not self._loaded:
-                self._append_loop_functions(self._compile(skip_optimisation))
+                self._append_loop_functions(MachineCode(self._write_module, skip_optimisation, self._key))
             elif not skip_optimisation and self._loaded[-1][0].skip_optimisation:
-                self._append_loop_functions(MachineCode(self._loaded[-1][0].ir_text))
+                self._append_loop_functions(self._loaded[-1][0].optimised())
             return self._loaded[-1][1:]
 
     def _append_loop_functions(self, machine_code: MachineCode) -> None:
@@ -339,10 +338,8 @@ CONVERGED_INDEX = 0
 """Index among the arguments of Newton's method of the flag that the stage equations are solved."""
 
 
-def compile_newton_solver(
-    program: Program, layout: BlockLayout, is_per_trajectory: np.ndarray, lanes: int
-) -> MachineCode:
-    """Compile the function ``solve(p, block, lane)``, which runs ``program`` on the arrays of one lane.
+def write_newton_solver(program: Program, layout: BlockLayout, is_per_trajectory: np.ndarray, lanes: int) -> ir.Module:
+    """Write for LLVM the function ``solve(p, block, lane)``, which runs ``program`` on the arrays of one lane.
 
     Parameters
     ----------
@@ -383,4 +380,4 @@ def compile_newton_solver(
     ):
         build.store(value, row_pointer(first_row + i))
     build.ret_void()
-    return MachineCode(module)
+    return module

@@ -28,36 +28,42 @@ class MachineCode:
 
     Parameters
     ----------
-    module : ir.Module, or its text
+    module : ir.Module, or a function that returns one or its text
+        A function is called if the code is not in the cache.
     skip_optimisation : bool
         Do not optimise the code, which takes longer than a short run. Its results are the same.
+    key : str, optional
+        Text that identifies the module in all processes, and finds its code in the cache; by default the module's text.
 
     Attributes
     ----------
     skip_optimisation : bool
         Whether the code is not optimised; code from the cache may be, even if it was not asked for.
-    ir_text : str
     """
 
-    def __init__(self, module: ir.Module | str, skip_optimisation: bool = False):
-        text = self.ir_text = str(module)
-        if lapack.SYMBOL_PREFIX in text:
-            lapack.bind_scipy_functions_in_llvm()
+    def __init__(self, module: ir.Module | Callable, skip_optimisation: bool = False, key: str = ""):
+        self._module_text = functools.cache(lambda: str(module() if callable(module) else module))
+        self._key = key
         with _lock:
             for self.skip_optimisation in (False, True) if skip_optimisation else (False,):
-                name = hashlib.sha256(
-                    f"{_host_target_cpu_features_and_text()[-1]} {self.skip_optimisation}\n{text}".encode()
-                ).hexdigest()[:32]
-                object_file = _parse_object_file(read_machine_code(name))
-                if object_file is not None:
+                name = _cache_name(f"{self.skip_optimisation}\n{key or self._module_text()}")
+                code = read_machine_code(name)
+                object_file = _parse_object_file(code)
+                if code is not None and object_file is not None:
                     break
             else:
-                code = _compile_module(text, skip_optimisation)
+                code = _compile_module(self._module_text(), skip_optimisation)
                 write_machine_code(name, code)
                 object_file = _parse_object_file(code)
+            if lapack.SYMBOL_PREFIX.encode() in code:
+                lapack.bind_scipy_functions_in_llvm()
             self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _new_target_machine())
             self._engine.add_object_file(object_file)
             self._engine.finalize_object()
+
+    def optimised(self) -> MachineCode:
+        """Return optimised machine code of the same module."""
+        return MachineCode(self._module_text, key=self._key)
 
     def function_address(self, name: str) -> int:
         """Return the address of the function ``name``."""
@@ -65,6 +71,26 @@ class MachineCode:
 
 
 _lock = threading.Lock()
+
+
+def _cache_name(text: str) -> str:
+    """Return the name in the cache of machine code that is identified by a text, on this machine."""
+    return hashlib.sha256(f"{_host_target_cpu_features_and_text()[-1]} {text}".encode()).hexdigest()[:32]
+
+
+COUNT_SUFFIX = ".count"
+"""Suffix of the files with the number of operations of a program."""
+
+
+def read_operation_count(key: str) -> int | None:
+    """Return the number of operations that was written for a key; None if there is none."""
+    content = read_machine_code(_cache_name(key), COUNT_SUFFIX)
+    return int(content) if content is not None and content.isdigit() else None
+
+
+def write_operation_count(key: str, count: int) -> None:
+    """Write the number of operations of the program with a key to the cache."""
+    write_machine_code(_cache_name(key), str(count).encode(), COUNT_SUFFIX)
 
 
 @functools.cache

@@ -15,12 +15,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import ClosedJaxpr
 
 from ...integrators import OneStepMethod
 from ...integrators.fluctuating import noise_dimension, with_noise_increments
 from ...systems.clock import system_of_step
 from ...tracing.caching import LRUCache
 from ...tracing.calls import deferred_p
+from ...tracing.fingerprint import compiler_fingerprint, program_fingerprint
+from ...tracing.program import Program
 from ...tracing.scalarize import report_compiler_faults, scalarize
 from ..adaptive_steps import ATTEMPT_FIELDS, attempt_step, initial_adaptive_state
 from ..root_bracket import packed_bracket_shape
@@ -35,10 +38,10 @@ from .loop_codegen import (
     BlockLayout,
     CompiledLoops,
     NamedProgram,
-    compile_newton_solver,
-    compile_step_loop,
+    write_newton_solver,
+    write_step_loop,
 )
-from .machine_code import MachineCode
+from .machine_code import MachineCode, read_operation_count, write_operation_count
 from .parameters import ProgramStructure
 
 STATE_FIELDS = State._fields
@@ -96,6 +99,8 @@ class CompiledStepLoop:
         Inputs of the initial state besides p and x; inputs of a step besides the fields.
     saved_fields : tuple of str
         Fields that are written out at each save.
+    n_operations : int
+        Number of scalar operations of a step with one iteration.
     """
 
     def __init__(
@@ -136,14 +141,9 @@ class CompiledStepLoop:
                 "event_values": control.event_shape,
                 "root_bracket": packed_bracket_shape(control.event_shape),
             }
-        step_program = self._trace_program(
-            self.fields_after_step, (*self.step_inputs, *self.field_names), self.field_names
-        )
-        if method.explicit:
-            variable_inputs = [i for i, a in enumerate(step_program.arguments) if a not in ("p", "h")]
-            step_program = step_program._replace(program=step_program.program.regroup_constant_factors(variable_inputs))
-        initial_program = self._trace_program(self.initial_fields, ("p", "x", *self.initial_inputs), self.field_names)
-        self._programs = {"step": step_program, "begin": initial_program}
+        self._step_jaxpr = self._trace(self.fields_after_step, (*self.step_inputs, *self.field_names))
+        self._initial_jaxpr = self._trace(self.initial_fields, ("p", "x", *self.initial_inputs))
+        self._is_explicit = method.explicit
         buffer_size = (
             0
             if method.explicit
@@ -160,10 +160,15 @@ class CompiledStepLoop:
             (first_rows[name], first_rows[name] + row_counts[name], self.field_shape(name)) for name in STATE_FIELDS
         ]
         state_names = [name for name in (*self.field_names, "h") if name in first_rows]
-        compile_loops = functools.partial(
-            compile_step_loop, self._programs, self._layout, state_names, is_per_trajectory, lanes, self.saved_fields
+        self._key = self._cache_key(self._step_jaxpr, self._initial_jaxpr)
+        self.n_operations = self._count_operations()
+        self._loops = CompiledLoops(
+            lambda: write_step_loop(
+                self._programs, self._layout, state_names, is_per_trajectory, lanes, self.saved_fields
+            ),
+            self._key,
+            lanes == 1 and self.n_operations <= MAX_UNOPTIMISED_OPERATIONS,
         )
-        self._loops = CompiledLoops(compile_loops, lanes == 1 and self.n_operations <= MAX_UNOPTIMISED_OPERATIONS)
 
     # -- what is compiled -----------------------------------------------------------------------------------------
 
@@ -231,15 +236,48 @@ class CompiledStepLoop:
         solution = solve_newton(equations, self._options)
         return tuple(1.0 * getattr(solution, name) for name in NEWTON_OUTPUTS)
 
-    @property
-    def n_operations(self) -> int:
-        """Number of scalar operations of a step with one iteration."""
-        return self._programs["step"].program.instruction_count
+    # Unrolling a program and writing it for LLVM take most of the time before a first step, and are only done if the
+    # machine code is not in the cache: it is found by the traced program.
 
-    def _trace_program(self, function: Callable, names: Sequence[str], results: Sequence[str] = ()) -> NamedProgram:
-        shapes = [jax.ShapeDtypeStruct(self.field_shape(a), jnp.float64) for a in names]
-        constants = [self._constant_parameters if a == "p" else None for a in names]
-        return NamedProgram(scalarize(jax.make_jaxpr(function)(*shapes), constants), tuple(names), tuple(results))
+    def _trace(self, function: Callable, names: Sequence[str]) -> ClosedJaxpr:
+        shapes = [jax.ShapeDtypeStruct(self.field_shape(name), jnp.float64) for name in names]
+        return jax.make_jaxpr(function)(*shapes)
+
+    def _scalarize(self, jaxpr: ClosedJaxpr) -> Program:
+        """Unroll a traced program, with the constant entries of its first argument, p, compiled in."""
+        return scalarize(jaxpr, [self._constant_parameters, *[None] * (len(jaxpr.jaxpr.invars) - 1)])
+
+    @functools.cached_property
+    def _programs(self) -> dict[str, NamedProgram]:
+        """Scalar programs of a step and of the initial state."""
+        step_names, initial_names = (*self.step_inputs, *self.field_names), ("p", "x", *self.initial_inputs)
+        step_program = self._scalarize(self._step_jaxpr)
+        if self._is_explicit:
+            variable_inputs = [i for i, name in enumerate(step_names) if name not in ("p", "h")]
+            step_program = step_program.regroup_constant_factors(variable_inputs)
+        initial_program = self._scalarize(self._initial_jaxpr)
+        return {
+            "step": NamedProgram(step_program, step_names, self.field_names),
+            "begin": NamedProgram(initial_program, initial_names, self.field_names),
+        }
+
+    def _count_operations(self) -> int:
+        """Return the number of operations of a step, from the cache if possible."""
+        count = read_operation_count(self._key) if self._key else None
+        if count is None:
+            count = self._programs["step"].program.instruction_count
+            if self._key:
+                write_operation_count(self._key, count)
+        return count
+
+    def _cache_key(self, *jaxprs: ClosedJaxpr) -> str:
+        """Return a text that identifies the machine code of these programs in all processes, or "" if none can."""
+        fingerprints = [compiler_fingerprint(), *map(program_fingerprint, jaxprs)]
+        if None in fingerprints:
+            return ""
+        layout = self._layout.row_counts, self.field_names, self.saved_fields, self.lanes, self._is_explicit
+        masks = self._constant_parameters.tobytes(), self._is_per_trajectory.tobytes()
+        return f"{fingerprints} {layout} {masks}"
 
     # -- trajectories in blocks -----------------------------------------------------------------------------------
 
@@ -414,8 +452,13 @@ class CompiledStepLoop:
         with self._lock, report_compiler_faults():
             if self._newton_code is None:
                 self._shapes[NEWTON_BUFFER] = (self._layout.row_counts[NEWTON_BUFFER],)
-                program = self._trace_program(self._solve_packed_newton, ("p", NEWTON_BUFFER)).program
-                self._newton_code = compile_newton_solver(program, self._layout, self._is_per_trajectory, self.lanes)
+                jaxpr = self._trace(self._solve_packed_newton, ("p", NEWTON_BUFFER))
+                self._newton_code = MachineCode(
+                    lambda: write_newton_solver(
+                        self._scalarize(jaxpr), self._layout, self._is_per_trajectory, self.lanes
+                    ),
+                    key=self._cache_key(jaxpr),
+                )
             return self._newton_code.function_address("solve")
 
 
