@@ -28,7 +28,7 @@ TARGET_ATTEMPTS_PER_CALL = 2**15
 
 
 RUNNING_CODES = (StatusCode.COMPLETED, StatusCode.PAUSED_AT_STOP, StatusCode.PAUSED_FOR_GROWTH_RATE)
-"""Status codes of trajectories that go on."""
+"""Status codes of trajectories that have not ended."""
 
 
 class AdaptiveEnsembleRun(EnsembleRun):

@@ -31,7 +31,7 @@ ARRAY_BATCH_SIZE = 65_536
 """Largest number of trajectories that the array engine runs at once, which bounds memory."""
 
 ARRAY_MAX_SAVED_VALUES = 2**26
-"""Approximate number of state components that one call of the array engine saves at most."""
+"""Approximate upper limit of the number of state components that one call of the array engine saves."""
 
 RECORDED_INITIAL_FIELDS = ("x", "energy", "entropy")
 """Fields of the initial engine states that a record needs; of final states it needs

@@ -1,5 +1,4 @@
-"""Derivatives of any order of a path whose steps are solved: of each step along directions, then accumulated over
-steps.
+"""Derivatives of any order of the states of a path, accumulated from the derivatives of its solved steps.
 
 A step maps ``z = (x, p)``, the state and the parameters, to the next state by the slopes k that solve its equations:
 

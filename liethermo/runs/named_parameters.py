@@ -25,10 +25,10 @@ from ..systems import System
 from ..tracing.caching import memoize
 
 WRAPPER_FIELDS = frozenset({"body", "part", "term", "function", "phi", "contact", "first"})
-"""Fields of the objects of a system that hold the object of the user, and are left out of names."""
+"""Fields of the library's wrapper objects that hold a user's object; names of parameters leave them out."""
 
 DERIVED_FIELDS = frozenset({"momentum_maps", "momentum_casimirs", "subsystems"})
-"""Fields of a system that follow from others. Their arrays have no names, but those of a Lagrangian in them."""
+"""Fields of a system that are computed from others; their arrays have no names, except those of a Lagrangian."""
 
 
 class NamedParameter(NamedTuple):

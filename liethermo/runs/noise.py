@@ -314,7 +314,7 @@ def _random_key_of_steps(run_step_code: int, halvings: int, high_word: int) -> t
 
 
 MEASURE_ROW = "the motion keeps the measure"
-"""Name of the row of a report on the conservation of the measure."""
+"""Name of the report row that judges the conservation of the measure."""
 
 
 def _noise_and_measure_residuals(model: tuple[System, Energy | None], x):

@@ -108,7 +108,7 @@ class MethodSuggestion:
 
 
 CANDIDATE_METHODS = (*map(MetriplecticRungeKutta, (4, 6, 8)), *map(MetriplecticGauss, (1, 2, 3, 4)))
-"""Methods that :func:`suggest_method` tries, beside a Taylor method of an order that depends on the tolerance."""
+"""Methods that :func:`suggest_method` tries, besides a Taylor method of an order that depends on the tolerance."""
 
 
 @with_library_settings
