@@ -179,8 +179,12 @@ MAX_LOCALS_PERCENT = 4.0
 
 
 @functools.cache
-def names_of_kind(kind: str) -> tuple[NameCheck, ...]:
-    return tuple(name for path in CODE for name in names_in(path) if name.kind == kind)
+def code_names() -> tuple[NameCheck, ...]:
+    return tuple(name for path in CODE for name in names_in(path))
+
+
+def names_of_kind(kind: str) -> list[NameCheck]:
+    return [name for name in code_names() if name.kind == kind]
 
 
 @pytest.mark.parametrize("kind", ["constant", "definition"])

@@ -114,7 +114,7 @@ class AdiabaticJumps(ThermalJumps):
         if is_traced(body_energy):
             groups = _distinct_level_pair_groups(structure.size)
         else:
-            hamiltonians = system.hamiltonians()
+            hamiltonians = system.hamiltonians_at_test_times()
             groups = _group_numbers_of_level_pairs(hamiltonians)
             self._check_rates_at_zero(hamiltonians)
         return replace_fields(self, pair_groups=Indices(groups))

@@ -24,7 +24,7 @@ from ..functions.density import matrix_logarithm
 from ..functions.gradients import EPS
 from ..functions.time_span import required_argument_count
 from .base import Dissipation
-from .checks import checked_rate
+from .checks import RATE_CONDITION, checked_rate
 from .operators import (
     ENERGY_RTOL,
     Operator,
@@ -103,7 +103,7 @@ class ThermalJumps(Dissipation):
     """
 
     operators: tuple[Operator, ...] = eqx.field(static=True)
-    rates: tuple[Any, ...]
+    rates: tuple[Any, ...] = eqx.field(metadata=RATE_CONDITION.metadata)
     bath: int = eqx.field(static=True)
     jumps: tuple[Jump, ...] = eqx.field(static=True, repr=False)
     jump_frame: Operator | None = eqx.field(static=True, repr=False)
@@ -148,7 +148,7 @@ class ThermalJumps(Dissipation):
                 "ThermalJumps need the eigenvectors of the Hamiltonian, so it must not be a traced value. Build a "
                 "system for each Hamiltonian, as lt.Study does. Rates, temperatures and capacities may be traced"
             )
-        hamiltonians = system.hamiltonians()
+        hamiltonians = system.hamiltonians_at_test_times()
         if not baths.number:
             jumps = tuple(Jump(V, i, 0.5 if is_hermitian(V) else 1.0) for i, V in enumerate(self.operators))
             conserves_energy = all(is_commuting(H, V) for H in hamiltonians for V in map(np.asarray, self.operators))

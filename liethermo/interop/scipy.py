@@ -18,7 +18,7 @@ from ..results.solution import Solution
 from ..runs.adaptive import Adaptive
 from ..runs.events import EventSpecification, direction_attribute_of_event, terminal_attribute_of_event
 from ..runs.integrate import integrate, solution_without_steps
-from ..runs.schedule import clip_times_to_span
+from ..runs.schedule import backward_span_message, clip_times_to_span
 from ..systems import System
 from ..systems.kind_checks import require_system
 
@@ -298,7 +298,7 @@ def _checked_t_span(t_span) -> tuple[float, float]:
     if math.isnan(start) or math.isnan(end) or math.isinf(start):
         raise InputError(f"t_span must start at a finite time, got ({start:g}, {end:g})")
     if end < start:
-        raise InputError(f"t_span = ({start:g}, {end:g}) runs backwards. Integrate over ({end:g}, {start:g}) instead")
+        raise InputError(backward_span_message(start, end))
     return start, end
 
 

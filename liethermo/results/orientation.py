@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..models.inertia import EQUAL_MOMENTS_RTOL
-from ..systems.rotations import check_scalar_place, checked_sequence
+from ..systems.rotations import axis_indices_of_sequence, check_quaternion_order
 from .audit_evidence import VELOCITY_AXES, AuditableResult
 
 ROTATION_GROUPS = ("SO(3)", "SE(3)")
@@ -39,7 +39,7 @@ def quaternions(solution: AuditableResult, scalar: Literal["last", "first"] = "l
     InputError
         If it has no such attitudes.
     """
-    check_scalar_place(scalar)
+    check_quaternion_order(scalar)
     g = _require_rotation_matrices(solution)
     has_times = _is_time_series(solution)
     is_finite = np.isfinite(g).all(axis=(-2, -1), keepdims=True)
@@ -103,7 +103,7 @@ def euler_angles(solution: AuditableResult, sequence: str = "zyx", degrees: bool
     InputError
         If it has no such attitudes, or the sequence is not of three letters.
     """
-    if len(checked_sequence(sequence)) != 3:
+    if len(axis_indices_of_sequence(sequence)) != 3:
         raise InputError(f"sequence must have three letters, got {sequence!r}")
     g = _require_rotation_matrices(solution)
     is_finite = np.isfinite(g).all(axis=(-2, -1), keepdims=True)

@@ -45,7 +45,7 @@ class AdaptiveEnsembleRun(EnsembleRun):
             lanes.step_loop, lanes.first_lane_parameters, parameters, x0, *self._start_first_stop_and_span_length
         )
         # finished trajectories free their lanes
-        indices, keep_only = np.arange(members.start, members.stop), adaptive_runs.keep_only
+        indices, keep_only = np.arange(members.start, members.stop), adaptive_runs.keep_trajectories
         self._advance_to_end(_BatchRecorder(self, adaptive_runs, indices, keep_only, stop_signal.is_set))
 
     def _run_vmapped_batch(self, padded_members: np.ndarray, n_members: int) -> None:
@@ -159,7 +159,7 @@ class _BatchRecorder:
         if self.keep_only is not None and 2 * self.is_running.sum() <= len(self.members) and self.is_running.any():
             running_indices = np.flatnonzero(self.is_running)
             self.keep_only(running_indices)
-            self.pause_handler.keep_only(running_indices)
+            self.pause_handler.keep_trajectories(running_indices)
             self.members, self.is_running = self.members[running_indices], self.is_running[running_indices]
             self.initial = {name: values[running_indices] for name, values in self.initial.items()}
 

@@ -19,7 +19,7 @@ from ..engines.adaptive_runs import EventOccurrence, EventRules
 from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..results.events import Events, EventSeries
 from ..systems import System
-from ..systems.kind_checks import user_system
+from ..systems.kind_checks import unwrap_user_system
 from ..tracing.numpy_calls import PythonCall, accept_jax_arrays
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import trace_callables
@@ -236,14 +236,14 @@ def _event_argument_by_name(name: str, system: System, t, x):
         return jnp.asarray(t, dtype=jnp.float64)
     if name == "attitude":
         assert system.attitude_layout is not None
-        return system.attitude_layout.split(x)[1]
+        return system.attitude_layout.split_state(x)[1]
     if name in ("parameters", "system"):
         return jnp.concatenate([jnp.ravel(a) for a in _parameters_of_user_system(system)] or [jnp.zeros(0)])
     return system.user_state(x)
 
 
 def _parameters_of_user_system(system: System) -> list:
-    return jax.tree_util.tree_leaves(eqx.filter(user_system(system), eqx.is_inexact_array))
+    return jax.tree_util.tree_leaves(eqx.filter(unwrap_user_system(system), eqx.is_inexact_array))
 
 
 def _trace_event_function(
@@ -331,9 +331,9 @@ def _pass_parameters_and_extra_arguments(
     """Return a function that calls the user's one, with its parameters as a dict or system and with extra arguments."""
     if not extra_arguments and not {"parameters", "system"} & set(argument_names):
         return user_function
-    tree = eqx.filter(user_system(system), eqx.is_inexact_array)
+    tree = eqx.filter(unwrap_user_system(system), eqx.is_inexact_array)
     paths, structure = jax.tree_util.tree_flatten_with_path(tree)
-    static = eqx.filter(user_system(system), eqx.is_inexact_array, inverse=True)
+    static = eqx.filter(unwrap_user_system(system), eqx.is_inexact_array, inverse=True)
     labels = [jax.tree_util.keystr(path).removeprefix(".") for path, _ in paths]
     shapes = [leaf.shape for _, leaf in paths]
 

@@ -33,7 +33,7 @@ from ..errors import InputError
 from ..functions.time_span import DeclaredTimes
 from ..integrators import OneStepMethod
 from ..systems import System
-from ..systems.clock import system_of_step
+from ..systems.clock import system_between_breaks
 from ..systems.kind_checks import require_system
 from ..tracing.programs import jit_cached, jit_unoptimised
 from .adaptive import Adaptive
@@ -417,7 +417,7 @@ def _differentiable_path_from_solved_steps(
 
         def step(x, solved_step, h=step_sizes[i]):
             _, compensation, k = solved_step
-            step_system = system_of_step(system, x)
+            step_system = system_between_breaks(system, x)
             k = _attach_implicit_derivative_to_slopes(step_system, method, x, compensation, h, k)
             return method.move(step_system, x, compensation, h, k)[0], None
 
@@ -462,7 +462,7 @@ def differentiable_step(
 ) -> tuple[jax.Array, ...]:
     """Return the carry after one step, differentiable by JAX; NaN if the stage equations cannot be solved."""
     x, compensation, k, older_k = carry
-    system = system_of_step(system, x)
+    system = system_between_breaks(system, x)
     if method.explicit:
         new_k = _converged_slopes_or_nan(explicit_stage_solution(system, method, x, compensation, h, k))
     else:

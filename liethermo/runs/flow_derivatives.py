@@ -28,7 +28,7 @@ from jax.interpreters import ad, batching, mlir
 
 from manifolds.matrices.linear import inverse
 
-from ..systems.clock import system_of_step
+from ..systems.clock import system_between_breaks
 from ..tracing.interpret import evaluate_at_points
 
 
@@ -176,7 +176,7 @@ class _StepFunction(eqx.Module):
             for leaf, is_parameter in zip(other_leaves, self.is_differentiated[:-1], strict=True)
         ]
         system, method, _ = jax.tree_util.tree_unflatten(structure, [*other_leaves, x])
-        return system_of_step(system, z[:n]), method, z[:n], z[len(z) - m :].reshape(self.slopes_shape)
+        return system_between_breaks(system, z[:n]), method, z[:n], z[len(z) - m :].reshape(self.slopes_shape)
 
     def __call__(self, h, compensation, z) -> jax.Array:
         """Return the residual of the stage equations, followed by the next state."""

@@ -21,19 +21,19 @@ from manifolds._pytree_module import replace_fields
 from ..integrators import OneStepMethod
 from ..integrators.preserved import casimir_residuals, is_momentum_map, nonconservation_message
 from ..systems import System
-from ..systems.conservation import judge_conservation, rates_of_change
+from ..systems.conservation import function_rates_of_change, judge_conservation
 from ..systems.interface import InvariantVerdicts
 from ..systems.invariants import (
-    first_multiple_indices,
-    functions_for_naming,
+    first_proportional_indices,
     invariants_by_construction,
-    n_random_states,
-    names_from_multiples,
-    random_states,
+    n_test_states_per_scale,
+    name_preserved_functions,
+    named_then_preserved_functions,
+    random_test_states,
     stack_gradients,
     states_near,
     systems_at_test_times,
-    undecided_functions,
+    undecided_function_names,
 )
 from ..tracing.interpret import evaluate_at_points
 from .system_family import Family
@@ -105,10 +105,10 @@ def group_members_by_invariants(
     member_indices, member = np.arange(len(initial_states)), family.representative
     if member.invariant_verdicts is not None:
         return [MemberGroup(member_indices, family)], {}
-    if not any(family.has_member_axis) and not undecided_functions(member):
+    if not any(family.has_member_axis) and not undecided_function_names(member):
         return [MemberGroup(member_indices, family)], {}
     invariant_tests = _MemberInvariantTests(family, member, method, initial_states)
-    if not (invariant_tests.casimirs or member.preserved or invariant_tests.requested_functions):
+    if not (invariant_tests.casimirs or member.preserved_functions or invariant_tests.requested_functions):
         return [MemberGroup(member_indices, family)], {}
     multiples, known_verdicts, requested_verdicts = (
         invariant_tests.proportional_function_indices(),
@@ -182,13 +182,13 @@ class _MemberInvariantTests:
 
     def proportional_function_indices(self) -> np.ndarray:
         """Return the index of a function proportional to each preserved function, or -1; shape (B, preserved)."""
-        count = len(self.member.preserved)
+        count = len(self.member.preserved_functions)
         if not count:
             return np.zeros((len(self.states), 0), dtype=int)
-        points = random_states(self.member, 2)
-        values_per_member = len(points) * len(functions_for_naming(self.member)) * self.member.dim
+        points = random_test_states(self.member, 2)
+        values_per_member = len(points) * len(named_then_preserved_functions(self.member)) * self.member.dim
         return self._evaluate_in_batches(
-            lambda rows: first_multiple_indices(
+            lambda rows: first_proportional_indices(
                 self._evaluate_at_member_points(
                     _gradients_of_functions_for_naming, rows, self._rescaled_points_per_member(points, rows)
                 ),
@@ -202,14 +202,14 @@ class _MemberInvariantTests:
 
         The shape is (B, Casimirs + preserved functions).
         """
-        count, member = len(self.casimirs) + len(self.member.preserved), self.member
+        count, member = len(self.casimirs) + len(self.member.preserved_functions), self.member
         verdicts = self._judge_functions(
             _rates_of_casimirs_and_preserved_functions, count, self.casimirs, use_nearby_states=True
         )
         # a torque may be zero at the test times only, so no function on which it acts counts as conserved
         torque = member.torque_laws
         has_torque = [name in torque.changed_casimirs for name in self.casimirs]
-        has_torque += [torque.name != ""] * len(member.preserved)
+        has_torque += [torque.name != ""] * len(member.preserved_functions)
         return np.where(np.array(has_torque, dtype=bool), VERDICT_NOT_CONSERVED, verdicts)
 
     def verdicts_of_requested_functions(self) -> np.ndarray:
@@ -247,7 +247,7 @@ class _MemberInvariantTests:
     ) -> InvariantFacts:
         """Return the invariant facts of a member, from its row of indices of proportional functions and of verdicts."""
         member = self.member
-        names = names_from_multiples(member, multiple_indices.tolist())
+        names = name_preserved_functions(member, multiple_indices.tolist())
         truth_values = {VERDICT_UNKNOWN: None, VERDICT_NOT_CONSERVED: False, VERDICT_CONSERVED: True}
         verdicts: dict[str, bool | None] = {}
         for name, verdict in zip((*names, *self.casimirs), np.roll(verdict_row, len(names)).tolist(), strict=True):
@@ -262,7 +262,7 @@ class _MemberInvariantTests:
     def _judge_functions(
         self, rates_of_functions: Callable, n_functions: int, functions: tuple, use_nearby_states: bool
     ) -> np.ndarray:
-        """Return verdicts on functions of each member, shape (B, n_functions), by the rules of :func:`.conserves`.
+        """Return verdicts on functions of each member, shape (B, n_functions), by the rules of :func:`.are_conserved`.
 
         With ``use_nearby_states``, states near the initial state are tried where random states leave a function
         undecided.
@@ -317,11 +317,9 @@ class _MemberInvariantTests:
                 is_defined[member_indices] |= defined_and_violated[:, 0]
                 is_violated[member_indices] |= defined_and_violated[:, 1]
 
-        sample_points = random_states(member, n_random_states(member))
-        for points in (
-            sample_points[:1],
-            sample_points[1:],
-        ):  # one state is enough to see that a function is not conserved
+        sample_points = random_test_states(member, n_test_states_per_scale(member))
+        # one state is enough to see that a function is not conserved
+        for points in (sample_points[:1], sample_points[1:]):
             undecided_members = np.flatnonzero(~is_violated.all(axis=1))
             judge_at_states(undecided_members, functools.partial(self._rescaled_points_per_member, points), len(points))
         if use_nearby_states:
@@ -366,7 +364,7 @@ class _MemberInvariantTests:
             _bath_entropy_scales, (self.family.program_structure, parameters.shape[1]), parameters
         )[:, None]
         points = points.copy()
-        points[..., self.member.body_dim :] *= scales / baths.scale
+        points[..., self.member.body_dim :] *= scales / baths.constant_entropy_scales
         return points
 
     def _evaluate_in_batches(
@@ -392,20 +390,22 @@ def _unpack_member_and_state(
 def _gradients_of_functions_for_naming(model, row):
     structure, n_parameters = model
     system, x = _unpack_member_and_state(structure, n_parameters, row)
-    return stack_gradients(functions_for_naming(system), x)
+    return stack_gradients(named_then_preserved_functions(system), x)
 
 
 def _rates_of_casimirs_and_preserved_functions(model, row):
     structure, n_parameters, casimirs, time = model
     system, x = _unpack_member_and_state(structure, n_parameters, row, time)
     casimir_functions = system.casimirs()
-    return rates_of_change((system, (*(casimir_functions[name] for name in casimirs), *system.preserved)), x)
+    return function_rates_of_change(
+        (system, (*(casimir_functions[name] for name in casimirs), *system.preserved_functions)), x
+    )
 
 
 def _rates_of_requested_functions(model, row):
     structure, n_parameters, functions, time = model
     system, x = _unpack_member_and_state(structure, n_parameters, row, time)
-    return rates_of_change((system, functions), x)
+    return function_rates_of_change((system, functions), x)
 
 
 def _casimir_residuals_of_requested_functions(model, row):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,14 +13,11 @@ from jax.tree_util import DictKey, GetAttrKey, SequenceKey
 
 from manifolds._arrays import host_array, real_array
 
-from ..dissipation.base import Dissipation
-from ..dissipation.checks import NEGATIVE_RATE_MESSAGE
 from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
 from ..errors import InputError
-from ..functions.bath_energy import BathEnergy
-from ..functions.conditions import condition_message, require_condition
+from ..functions.conditions import Condition, condition_of_field
 from ..functions.energy import Quadratic
-from ..models.inertia import inverse_moments
+from ..models.inertia import INERTIA_CONDITION, inverse_moments
 from ..systems import System
 from ..tracing.caching import memoize
 
@@ -40,12 +37,15 @@ class NamedParameter(NamedTuple):
     leaf_indices : tuple of int
         Numbers of the arrays of the system that hold the parameter, in the order of :func:`parameter_arrays`.
     is_inverse : bool
-        Whether these arrays hold the inverse, as those of an energy with moments of inertia do.
+        Whether these arrays hold the inverse: those of an energy with moments of inertia do.
+    condition : Condition or None
+        The condition of the constructor on the value.
     """
 
     value: np.ndarray
     leaf_indices: tuple[int, ...]
     is_inverse: bool = False
+    condition: Condition | None = None
 
     def to_stored_array(self, value):
         """Return the array that the system stores for a value of the parameter, or for several along the first axis.
@@ -82,78 +82,41 @@ def replace_parameters(system: System, parameter_values: Mapping[str, Any]) -> S
     # the system's own arrays, which cannot change in place, so that results for the new system can be cached
     leaves: list[Any] = jax.tree_util.tree_leaves(eqx.filter(system, eqx.is_inexact_array))
     names_by_leaf: dict[int, str] = {}
-    conditions = parameter_conditions_by_leaf(system)
     for name, value in parameter_values.items():
         parameter = require_parameter(system, name)
         array = host_array(real_array(value))
         if array.shape != parameter.value.shape:
             raise InputError(f"{name} must have shape {parameter.value.shape}, got {array.shape}")
         _record_name_of_leaves(names_by_leaf, name, parameter)
+        if parameter.condition is not None:
+            parameter.condition.require(array)
         for i in parameter.leaf_indices:
             leaves[i] = real_array(parameter.to_stored_array(array))
-            if i in conditions:
-                require_condition(leaves[i], conditions[i].test, conditions[i].template)
     return ProgramStructure.from_module(system).rebuild(leaves)
 
 
-class ParameterCondition(NamedTuple):
-    """A condition that the constructor of a class puts on a field, and that new values of the field must meet.
-
-    Attributes
-    ----------
-    owner_class : type
-    field_name : str
-    test : function from an array to an array of truth values
-    template : str
-        The message of the error, with a placeholder ``{value}``.
-    """
-
-    owner_class: type
-    field_name: str
-    test: Callable
-    template: str
-
-
-PARAMETER_CONDITIONS = (
-    ParameterCondition(Dissipation, "rate", lambda value: value >= 0.0, NEGATIVE_RATE_MESSAGE),
-    ParameterCondition(
-        BathEnergy, "capacity", lambda value: value > 0.0, "the capacity of a bath must be positive, got {value}"
-    ),
-    ParameterCondition(
-        BathEnergy, "temperature", lambda value: value > 0.0, "the temperature of a bath must be positive, got {value}"
-    ),
-)
-
-
-def parameter_conditions_by_leaf(system: System) -> dict[int, ParameterCondition]:
-    """Return the conditions on arrays of a system as a dict from the numbers of the arrays."""
-    conditions = {}
-    leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_inexact_array))
-    for i, (path, _) in enumerate(leaves):
-        for condition in PARAMETER_CONDITIONS:
-            is_field = bool(path) and path[-1] == GetAttrKey(condition.field_name)
-            if is_field and isinstance(_node_at(system, path[:-1]), condition.owner_class):
-                conditions[i] = condition
-    return conditions
-
-
-def reasons_of_refused_members(system: System, member_arrays: Sequence[np.ndarray]) -> dict[int, str]:
-    """Return the reasons why constructors refuse the parameter values of some members of a family, by member index.
+def reasons_of_refused_members(system: System, parameter_values: Mapping[str, Any]) -> dict[int, str]:
+    """Return the members of a family with a value that the constructor of its object refuses, with the reasons.
 
     Members with NaN are left out: the family has a reason for them.
 
     Parameters
     ----------
     system : System
-    member_arrays : list of array
-        As :func:`stack_member_arrays` returns them.
+    parameter_values : mapping of str to array, shape (members, ...)
     """
-    reasons = {}
-    for i, condition in parameter_conditions_by_leaf(system).items():
-        is_refused = ~np.asarray(condition.test(member_arrays[i])) & ~np.isnan(member_arrays[i])
-        for member in np.flatnonzero(is_refused.reshape(len(member_arrays[i]), -1).any(axis=1)):
-            reasons[int(member)] = condition_message(condition.template, member_arrays[i][member])
+    reasons: dict[int, str] = {}
+    for name, value in parameter_values.items():
+        condition = require_parameter(system, name).condition
+        if condition is not None:
+            reasons |= condition.violations(np.asarray(value, dtype=np.float64))
     return reasons
+
+
+def _condition_at(system: System, path: Sequence[Any]) -> Condition | None:
+    """Return the condition of the field of a system that holds the array at a path; None if it has none."""
+    ends = [i for i, key in enumerate(path) if isinstance(key, GetAttrKey)]
+    return condition_of_field(_node_at(system, path[: ends[-1]]), path[ends[-1]].name) if ends else None
 
 
 def _node_at(tree: Any, path: Sequence[Any]) -> Any:
@@ -230,6 +193,7 @@ def _parameters_by_name_and_by_path(system: System) -> tuple[dict[str, NamedPara
     fields = [[jax.tree_util.keystr((key,)).removeprefix(".") for key in path] for path, _ in paths_and_leaves]
     paths = [jax.tree_util.keystr(path).removeprefix(".") for path, _ in paths_and_leaves]
     arrays, has_derived_energy = parameter_arrays(system), _has_derived_energy(fields)
+    conditions = [_condition_at(system, path) for path, _ in paths_and_leaves]
     leaves_by_name: dict[str, list[int]] = {}
     for i, path_fields in enumerate(fields):
         is_of_lagrangian = "lagrangian" in path_fields
@@ -242,9 +206,10 @@ def _parameters_by_name_and_by_path(system: System) -> tuple[dict[str, NamedPara
     for name, leaves in leaves_by_name.items():
         value = arrays[leaves[0]]
         if all(np.array_equal(arrays[i], value, equal_nan=True) for i in leaves):
-            parameters_by_name[name] = NamedParameter(value, tuple(leaves))
+            condition = next((conditions[i] for i in leaves if conditions[i] is not None), None)
+            parameters_by_name[name] = NamedParameter(value, tuple(leaves), condition=condition)
         else:  # different parameters, whose paths differ in the fields of wrappers only
-            parameters_by_name |= {paths[i]: NamedParameter(arrays[i], (i,)) for i in leaves}
+            parameters_by_name |= {paths[i]: NamedParameter(arrays[i], (i,), condition=conditions[i]) for i in leaves}
     parameters_by_path = {
         paths[i]: parameter for parameter in parameters_by_name.values() for i in parameter.leaf_indices
     }
@@ -287,5 +252,5 @@ def _replace_energy_matrix_by_inertia(
         return parameters_by_name
     parameters_by_path["energy.A"] = matrix
     inverse = 1.0 / matrix.value if matrix.value.ndim == 1 else np.linalg.inv(matrix.value)
-    inertia = NamedParameter(inverse, matrix.leaf_indices, is_inverse=True)
+    inertia = NamedParameter(inverse, matrix.leaf_indices, is_inverse=True, condition=INERTIA_CONDITION)
     return {"energy.inertia": inertia, **{name: p for name, p in parameters_by_name.items() if name != "energy.A"}}

@@ -27,7 +27,7 @@ from ..systems import (
     make_autonomous,
 )
 from ..systems.clock import WORK_NAME
-from ..systems.invariants import recorded_functions_with_verdicts, resolve_invariants_near, undecided_functions
+from ..systems.invariants import recorded_functions_with_verdicts, resolve_invariants_near, undecided_function_names
 from ..systems.transport import has_generator
 from ..tracing.caching import LRUCache, memoize
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
@@ -110,7 +110,7 @@ def resolve_invariants(system: System, x0) -> System:
 @memoize
 def has_undecided_invariants(system: System) -> bool:
     """Return whether some conservation laws of the system must be tested near the initial state of a run."""
-    return not is_traced(system) and bool(undecided_functions(system))
+    return not is_traced(system) and bool(undecided_function_names(system))
 
 
 @memoize
@@ -260,7 +260,10 @@ def check_shapes_of_method(system: System, method: OneStepMethod) -> None:
 def promised_laws(system: System, method, invariants) -> Laws:
     """Return the laws promised for a run: energy, entropy, and the invariants that the method preserves."""
     method_preserves = method.preserves_function if isinstance(method, OneStepMethod) else lambda system, name: False
-    constants = [*(name for name, (_, is_conserved) in invariants.items() if is_conserved), *system.constant_names]
+    constants = [
+        *(name for name, (_, is_conserved) in invariants.items() if is_conserved),
+        *system.vector_invariant_names,
+    ]
     unknown = tuple(name for name, (_, is_conserved) in invariants.items() if is_conserved is None)
     conserved_names = tuple(name for name in constants if method_preserves(system, name))
     unpromised_names = tuple(name for name in constants if name not in conserved_names)

@@ -56,7 +56,9 @@ class Problem:
         self.state_shape = system.shape if system.sites else (system.dim,)
         kind = type(system)
         self.has_fixed_domain = system.space is None and system.domain.allows_every_start
-        self.starts_anywhere = self.has_fixed_domain and system.inner is None and kind.state_array is System.state_array
+        self.starts_anywhere = (
+            self.has_fixed_domain and system.inner_system is None and kind.state_array is System.state_array
+        )
 
     @classmethod
     def from_user(

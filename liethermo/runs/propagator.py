@@ -387,7 +387,7 @@ class Propagator(metaclass=ListedType):
     def _varied_parameters_or_none(self, names: tuple[str, ...]) -> VariedParameters | None:
         """Return the named parameters as arguments of machine code, or None if their values may change the program."""
         problem = self._problem_of_compiled_final_states
-        if problem is None or not problem.has_fixed_domain or self.system.preserved:
+        if problem is None or not problem.has_fixed_domain or self.system.preserved_functions:
             return None
         try:
             return VariedParameters(self.system, self.method, names)
@@ -403,7 +403,7 @@ class Propagator(metaclass=ListedType):
         if has_undecided_invariants(self.system):  # what is conserved may depend on the initial state
             return None
         problem = self._problem_of_run_from()
-        return problem if problem.system.inner is None else None
+        return problem if problem.system.inner_system is None else None
 
 
 def _defer_final_state_to_run(x0) -> None:

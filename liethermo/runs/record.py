@@ -169,9 +169,9 @@ class EnsembleRecord:
             )
         x0, attitude, attitude0, work = self.x0, None, None, self.work
         if (layout := self.member.attitude_layout) is not None:
-            x0, attitude0 = map(np.asarray, layout.split(x0))
+            x0, attitude0 = map(np.asarray, layout.split_state(x0))
             if x is not None:
-                x, attitude = map(np.asarray, layout.split(x))
+                x, attitude = map(np.asarray, layout.split_state(x))
         if self.clock is not None:
             if self.trajectories is not None:
                 work = np.asarray(self.clock.work(x))

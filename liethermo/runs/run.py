@@ -17,7 +17,7 @@ import numpy as np
 from manifolds.errors import warn
 
 from ..engines.status_codes import StatusCode
-from ..engines.step import SavedStates, State, energy_and_entropy_at, system_and_state_at_step_start
+from ..engines.step import SavedStates, State, energy_and_entropy_at, system_and_state_after_jump
 from ..errors import FileError
 from ..integrators import Reference
 from ..integrators.fluctuating import noise_dimension
@@ -25,7 +25,7 @@ from ..results.events import Events
 from ..results.solution import DenseOutput, Solution, defer
 from ..results.status import Stats, Status
 from ..systems import System
-from ..systems.clock import system_of_step
+from ..systems.clock import system_between_breaks
 from ..tracing.interpret import evaluate_at_points
 from .adaptive import Adaptive, make_step_control
 from .adaptive_run import MAX_STORED_VALUES, AcceptedSteps, AdaptiveRun
@@ -267,7 +267,7 @@ class Run:
         x, n_evaluations, energy = np.array(self.saved_states[0]), 0, self.saved_energies_entropies[0][0, 0]
         clock = self.system.clock
         for first_index, last_index in itertools.pairwise([0, *break_indices.tolist(), len(times) - 1]):
-            system, x[-1] = system_and_state_at_step_start(self.system, jnp.asarray(x[-1]), energy)
+            system, x[-1] = system_and_state_after_jump(self.system, jnp.asarray(x[-1]), energy)
             states, n, message, was_interrupted = self.method.trajectory(
                 system, x[-1], times[first_index : last_index + 1]
             )
@@ -347,7 +347,7 @@ def _energy_and_entropy_after_break(system: System, x) -> tuple[jax.Array, jax.A
 
     The work in the state includes the jump of the energy at the break.
     """
-    return energy_and_entropy_at(system_of_step(system, x), x)
+    return energy_and_entropy_at(system_between_breaks(system, x), x)
 
 
 def _longest_step_after_each_save(

@@ -409,6 +409,15 @@ def _veltkamp_split(number) -> tuple[np.ndarray, np.ndarray]:
     return high_part, number - high_part
 
 
+def backward_span_message(start: float, end: float) -> str:
+    """Return the message of the error for a span whose end is before its start."""
+    return (
+        f"t_span must be finite and increasing, got ({start:g}, {end:g}). To find an earlier state, integrate the "
+        "equations with SciPy, which conserves no law exactly: scipy.integrate.solve_ivp(lambda t, x: "
+        f"system.vector_field(x, t), ({start!r}, {end!r}), x0, rtol=1e-10, atol=1e-12)"
+    )
+
+
 def checked_span(span, allow_infinite_end: bool = False) -> tuple[float, float]:
     """Return start and end of a span as floats; raise InputError unless they are finite and increasing."""
     try:
@@ -416,6 +425,8 @@ def checked_span(span, allow_infinite_end: bool = False) -> tuple[float, float]:
     except (TypeError, ValueError):
         raise InputError(f"t_span must be two numbers (start, end), got {span!r:.60}") from None
     if not (math.isfinite(start) and end > start and (allow_infinite_end or math.isfinite(end))):
+        if -math.inf < end < start < math.inf:
+            raise InputError(backward_span_message(start, end))
         cure = "" if end != math.inf else (
             ". An infinite end needs lt.integrate with adaptive steps and an event to stop at: step=lt.Adaptive(rtol), "
             "until=event"

@@ -107,7 +107,7 @@ class Family:
                     "are expected. Give the moments of each trajectory as a row, or a system with a tensor"
                 )
         arrays = stack_member_arrays(system, parameters)
-        reasons = reasons_of_refused_members(system, arrays)
+        reasons = reasons_of_refused_members(system, parameters)
         return cls(
             ProgramStructure.from_module(system), arrays, None if parameters else system, refusal_reasons=reasons
         )

@@ -18,8 +18,9 @@ from ..results.step_sampling import vector_field_at
 from ..systems import System
 from .adaptive import Adaptive
 
-RETRY_DIVISORS = (2.0, 8.0, 64.0, 1024.0, 16384.0)
-"""Divisors of a failed step size; the quotients are tried, to advise a smaller step."""
+RETRY_DIVISORS = (2.0, 8.0, 64.0, 1024.0, 2.0**14, 2.0**20, 2.0**27)
+"""Divisors of a failed step size; the quotients are tried, to advise a smaller step. The largest are for rates that
+contain an exponential, as those of jumps in a cold bath do."""
 
 BLOW_UP_SIZE = float(np.finfo(float).max) ** 0.25
 """Norm of a state that counts as unbounded; a quartic function overflows there."""
@@ -256,33 +257,45 @@ def final_status(engine: EngineWithFallback, state, t: float, h: float, interrup
             + _try_shorter_steps_and_advise(engine, state, h)
         )
         return Status(StatusCode.NOT_CONVERGED, message, step, t, residual)
-    if engine.system.surface is not None and (
+    if engine.system.constraint_surface is not None and (
         reason := engine.system.domain.why_outside(_predicted_state(engine, state, h))
     ):
         text = f"{step_text}, could not be taken: {reason}. Try a smaller step, where the motion itself stays inside"
         return Status(StatusCode.NON_FINITE, text, step, t, residual)
+    shorter_step = _step_size_that_succeeds(engine, state, h)
+    advice = (
+        "Check the domain of your functions along the trajectory, or try a smaller step"
+        if shorter_step is None
+        else f"Try a smaller step, for example {shorter_step:g}"
+    )
     message = (
         f"NaN or infinity in {step_text}: the energy, the entropy or the vector field is not finite there "
-        f"({_reason_of_non_finite_step(engine, state, h)}). Check the domain of your functions along the trajectory, "
-        "or try a smaller step"
+        f"({_reason_of_non_finite_step(engine, state, h)}). {advice}"
     )
     return Status(StatusCode.NON_FINITE, message, step, t, residual)
 
 
 def _try_shorter_steps_and_advise(engine: EngineWithFallback, state, h: float) -> str:
-    """Return advice on a failed step of size h: a shorter step that succeeds, or that none of those tried does."""
-    state = state._replace(status=jnp.zeros_like(jnp.asarray(state.status)))
-    for divisor in RETRY_DIVISORS:
-        if int(engine.step(state, h / divisor).status) == StatusCode.COMPLETED:
-            stiff = (
-                "; if that is far below what the motion needs, it is stiff or not smooth, and lt.MetriplecticGauss "
-                "takes long steps"
-            )
-            return f"Try a smaller step, for example {h / divisor:g}{stiff if engine.method.explicit else ''}"
+    """Return advice on a failed step of size h, after trying shorter steps: a size that succeeds, or that none does."""
+    if (shorter_step := _step_size_that_succeeds(engine, state, h)) is not None:
+        stiff = (
+            "; if that is far below what the motion needs, it is stiff or not smooth, and lt.MetriplecticGauss "
+            "takes long steps"
+        )
+        return f"Try a smaller step, for example {shorter_step:g}{stiff if engine.method.explicit else ''}"
     return (
         f"Steps down to {h / RETRY_DIVISORS[-1]:g} were tried and do not help: the functions may not be smooth there, "
         "or lose more digits than the iteration expects, as differences of large terms do"
     )
+
+
+def _step_size_that_succeeds(engine: EngineWithFallback, state, h: float) -> float | None:
+    """Return the size of a step from a state that succeeds, shorter than the failed size h; None if none is found."""
+    state = state._replace(status=jnp.zeros_like(jnp.asarray(state.status)))
+    for divisor in RETRY_DIVISORS:
+        if int(engine.step(state, h / divisor).status) == StatusCode.COMPLETED:
+            return h / divisor
+    return None
 
 
 def _predicted_state(engine: EngineWithFallback, state, h: float) -> jax.Array:

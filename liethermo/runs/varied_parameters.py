@@ -16,16 +16,16 @@ from ..engines.compiled.machine_code import PointEvaluator
 from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
 from ..errors import LiethermoError
 from ..systems import System
-from ..systems.conservation import AXIOM_TOLERANCE, judge_conservation, rates_of_change
+from ..systems.conservation import AXIOM_TOLERANCE, function_rates_of_change, judge_conservation
 from ..systems.invariants import (
+    candidate_invariants,
     find_invariants,
     invariants_by_construction,
-    n_random_states,
-    named_functions,
-    random_states,
+    n_test_states_per_scale,
+    random_test_states,
 )
 from ..tracing.trace_errors import TRACE_ERRORS
-from .named_parameters import parameter_conditions_by_leaf, require_parameter
+from .named_parameters import require_parameter
 from .preparation import prepare_system_and_method
 from .problem import Problem
 
@@ -82,21 +82,14 @@ class VariedParameters:
         self.entries = np.concatenate([self._leaves[i].ravel() for i in self._varied_leaves])
         slots = iter(self._split_by_leaf(self.entries))
         self._slots = [(parameter, [next(slots) for _ in parameter.leaf_indices]) for parameter in parameters]
-        conditions = parameter_conditions_by_leaf(system)
-        self._conditions = [
-            (conditions[i].test, slot)
-            for parameter, slots_of_leaves in self._slots
-            for i, slot in zip(parameter.leaf_indices, slots_of_leaves, strict=True)
-            if i in conditions
-        ]
         self._functions = tuple(
-            name for name in named_functions(system) if name not in invariants_by_construction(system)
+            name for name in candidate_invariants(system) if name not in invariants_by_construction(system)
         )
-        self._bath_scales = np.asarray(system.baths.scale)
+        self._bath_scales = np.asarray(system.baths.constant_entropy_scales)
         self._codes: list[float] = []
         self._test = None
         if self._functions:
-            states = random_states(system, n_random_states(system))
+            states = random_test_states(system, n_test_states_per_scale(system))
             self._test = PointEvaluator(self._conservation_verdict_codes, self.entries, states)
 
     def set_values_and_get_program_key(self, parameter_values: Iterable[Any]) -> Hashable | None:
@@ -109,11 +102,11 @@ class VariedParameters:
             array = np.asarray(value, dtype=np.float64)
             if array.shape != parameter.value.shape:
                 return None
+            if parameter.condition is not None and not parameter.condition.holds(array):
+                return None
             leaf = parameter.to_stored_array(array)
             for slot in slots:
                 slot[...] = leaf
-        if not all(test(slot).all() for test, slot in self._conditions):
-            return None
         if self._test is not None:
             self._codes = self._test().min(axis=0).tolist()
             if not all(code in (0.0, CONSERVED_CODE) for code in self._codes):
@@ -168,8 +161,8 @@ class VariedParameters:
         system = self._system_with_entries(entries)
         if system.baths.number:  # the entropies of baths scale with their capacities
             x = x.at[system.body_dim :].multiply(system.baths.entropy_scales() / self._bath_scales)
-        functions = tuple(named_functions(system)[name] for name in self._functions)
-        rates = rates_of_change((system, functions), x)
+        functions = tuple(candidate_invariants(system)[name] for name in self._functions)
+        rates = function_rates_of_change((system, functions), x)
         # a motion that is the rounding error of zero changes functions, relative to its own speed
         other_gradient = jnp.linalg.norm(system.energy.gradient(x)) * jnp.cos(jnp.arange(1.0, x.shape[0] + 1.0))
         lengths = jnp.stack([jnp.linalg.norm(f.gradient(x)) for f in functions])

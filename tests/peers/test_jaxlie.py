@@ -111,7 +111,7 @@ def test_translation_of_the_exponential():
         assert max_abs(np.asarray(group.log(g))[3:] - u) < 20 * EXACT  # V^-1
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 def test_descent_in_the_group(group):
     """Their test of gradients: five steps against the gradient of ``|log g|^2`` lower it; here it is known, 2 log g."""
     v = vectors(group, 8, count=1)[0]

@@ -64,7 +64,7 @@ HAMILTONIANS = {
 }
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("H", HAMILTONIANS)
 def test_constant_decay(H):
     """``9 exp(-kappa t)`` quanta; QuTiP asks for 1e-6."""
@@ -102,6 +102,7 @@ def test_stepping_and_a_rate_that_is_switched_off():
     assert quanta[1] == pytest.approx(quanta[0], abs=1e-13)
 
 
+@pytest.mark.slow
 def test_pickling():
     q = lt.QuantumSystem(NUMBER, lt.ThermalJumps([(A, 0.1)]), lt.HeatBaths(np.inf, 0.5))
     copy = pickle.loads(pickle.dumps(q))
@@ -118,7 +119,7 @@ def test_a_hamiltonian_that_is_not_hermitian_is_refused():
 # -- a qubit: testQubitDynamics1, 2 ------------------------------------------------------------------------------------
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("g2", [0.1, 0.0])
 def test_qubit_dynamics(g2):
     """A rotation about x with dephasing by ``sqrt(g2) sz``; QuTiP compares with a formula that is right to 0.05."""

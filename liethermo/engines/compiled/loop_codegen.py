@@ -30,7 +30,7 @@ INT64_POINTER = INT64.as_pointer()
 
 
 class NamedProgram(NamedTuple):
-    """A program with the names of the arrays that it reads and writes."""
+    """A program with names for the arrays that it reads and writes."""
 
     program: Program
     arguments: tuple[str, ...]
@@ -38,7 +38,7 @@ class NamedProgram(NamedTuple):
 
 
 class BlockLayout:
-    """Layout of a block: the first row and the number of rows of each array, by name."""
+    """The rows of a block that hold each array: the first row and their number, by name."""
 
     def __init__(self, shapes: Mapping[str, tuple[int, ...]]):
         self.row_counts = {name: math.prod(shape) for name, shape in shapes.items()}
@@ -100,7 +100,7 @@ class CompiledLoops:
         ] = []  # kept loaded, because a thread may be running any of them
 
     def loop_functions(self, n_steps: int, planned_steps: int = 0) -> tuple[Any, Any]:
-        """Return ``begin`` and ``advance``, optimised if ``n_steps`` now and ``planned_steps`` later are worth it."""
+        """Return the functions ``begin`` and ``advance``, optimised if the numbers of steps are worth it."""
         if self._loaded and not self._loaded[-1][0].skip_optimisation:
             return self._loaded[-1][1:]
         with self._lock, report_compiler_faults():
@@ -115,6 +115,7 @@ class CompiledLoops:
             return self._loaded[-1][1:]
 
     def _append_loop_functions(self, machine_code: MachineCode) -> None:
+        """Append the functions of machine code to those in memory."""
         self._loaded.append(
             (
                 machine_code,
@@ -176,11 +177,13 @@ class _StepLoopWriter(ProgramWriter):
         self.block, self.block_index = self.builder.alloca(FLOAT64_POINTER), self.builder.alloca(INT64)
 
     def _allocate_slots(self, name: str) -> list[ir.Value]:
+        """Return new stack slots for the entries of an array."""
         return [self.builder.alloca(self.double_type, name=f"{name}_{i}") for i in range(self.layout.row_counts[name])]
 
     # -- the loops ----------------------------------------------------------------------------------------------------
 
     def write_loops(self) -> None:
+        """Write ``advance``: loops over blocks and steps with saves."""
         build, argument = self.builder, self.arguments
         for slot in itertools.chain.from_iterable(self.slots.values()):
             build.store(self.constant(0.0), slot)
@@ -222,13 +225,13 @@ class _StepLoopWriter(ProgramWriter):
         self.builder.ret_void()
 
     def select_block(self, block_number: ir.Value) -> None:
-        """Make block i the one that the following instructions work on."""
+        """Make a block the one that the following instructions work on."""
         offset = self.builder.mul(block_number, self.int64(self.layout.n_rows * self.lanes))
         self.builder.store(self.builder.gep(self.arguments["blocks"], [offset]), self.block)
         self.builder.store(block_number, self.block_index)
 
     def copy_noise_increments_to_slots(self, step_number: ir.Value) -> None:
-        """Load the increments of a step from row ``step_number`` of ``noise``."""
+        """Copy the noise increments of a step to the slots of ``dW``."""
         build, slots = self.builder, self.slots["dW"]
         row = build.mul(step_number, self.int64(len(slots) * self.lanes))
         for j, slot in enumerate(slots):
@@ -271,7 +274,7 @@ class _StepLoopWriter(ProgramWriter):
     # -- rows and slots -----------------------------------------------------------------------------------------------
 
     def write_program_and_store_results(self, name: str) -> None:
-        """Run a program; in the active lanes its results replace the old values."""
+        """Write a program and store its results in slots, in the active lanes only."""
         named_program, build, active_lanes = self.programs[name], self.builder, self.active_lanes
 
         def read(i: int, j: int) -> ir.Value:
@@ -299,6 +302,7 @@ class _StepLoopWriter(ProgramWriter):
                 )
 
     def load_parameter(self, i: int) -> ir.Value:
+        """Return parameter i, from the block if it differs between trajectories."""
         row, build = self.parameter_rows[i], self.builder
         if row is not None:
             return build.load(self.row_pointer(self.layout.first_rows["p"] + row), align=8)
@@ -307,21 +311,24 @@ class _StepLoopWriter(ProgramWriter):
         return self.splat(value)
 
     def row_pointer(self, row: int) -> ir.Value:
+        """Return the pointer to a row of the current block."""
         start = self.builder.gep(self.builder.load(self.block), [self.int64(row * self.lanes)])
         return self.builder.bitcast(start, self.double_type.as_pointer())
 
     def load_fields_from_block(self, names: Sequence[str]) -> None:
+        """Copy fields from the current block to slots."""
         for name in names:
             for i, slot in enumerate(self.slots[name]):
                 self.builder.store(self.builder.load(self.row_pointer(self.layout.first_rows[name] + i), align=8), slot)
 
     def store_fields_in_block(self, names: Sequence[str]) -> None:
+        """Copy fields from slots to the current block."""
         for name in names:
             for i, slot in enumerate(self.slots[name]):
                 self.builder.store(self.builder.load(slot), self.row_pointer(self.layout.first_rows[name] + i), align=8)
 
     def store_saved_fields(self, block_number: ir.Value, save_number: ir.Value) -> None:
-        """Write the saved fields of block i to ``out``, as save ``save_number``."""
+        """Write the saved fields of a block to ``out``, as save ``save_number``."""
         build, argument = self.builder, self.arguments
         saved_slots = [slot for name in self.saved_names for slot in self.slots[name]]
         row = build.add(build.mul(block_number, argument["saves"]), build.sub(save_number, self.int64(1)))

@@ -24,7 +24,7 @@ from .llvm_writer import FLOAT64, INT64, ProgramWriter
 
 
 class MachineCode:
-    """Machine code of a module, unloaded with this object.
+    """Machine code of an LLVM module, which is unloaded when this object is deleted.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def write_operation_count(key: str, count: int) -> None:
 
 @functools.cache
 def _host_target_cpu_features_and_text() -> tuple[llvm.Target, str, str, str]:
-    """Return the LLVM target, CPU and features of this machine, and a text that identifies them and the LLVM version.
+    """Return the LLVM target, CPU and features of this machine, and a text that identifies them.
 
     ``$LIETHERMO_CPU`` selects another CPU whose instructions this machine supports, by its LLVM name, such as
     ``x86-64-v3``, which has AVX2 and no AVX-512.
@@ -113,13 +113,13 @@ def _host_target_cpu_features_and_text() -> tuple[llvm.Target, str, str, str]:
 
 
 def _new_target_machine(skip_optimisation: bool = False) -> llvm.TargetMachine:
-    """Return an LLVM compiler for this machine; an engine created with it owns it."""
+    """Return a new LLVM compiler for this machine, optimising unless ``skip_optimisation``."""
     target, cpu, features, _ = _host_target_cpu_features_and_text()
     return target.create_target_machine(cpu, features, opt=0 if skip_optimisation else 3, jit=True, reloc="pic")
 
 
 def _parse_object_file(code: bytes | None) -> llvm.ObjectFileRef | None:
-    """Return the code as an object file for the linker; None if it is no valid object file, which would crash LLVM."""
+    """Return machine code as an object file for LLVM's linker; None if it is invalid, which would crash LLVM."""
     if code is None or not (code.startswith(OBJECT_FILE_MAGICS) or _is_valid_elf(code)):
         return None
     try:
@@ -133,7 +133,7 @@ OBJECT_FILE_MAGICS = (b"\xcf\xfa\xed\xfe", b"\x64\x86", b"\x64\xaa")
 
 
 def _is_valid_elf(code: bytes) -> bool:
-    """Return whether the bytes are a relocatable ELF object whose sections all lie within them."""
+    """Return whether code is a relocatable ELF object whose sections all lie within its bytes."""
     if len(code) < 64 or code[:5] != b"\x7fELF\x02" or struct.unpack_from("<H", code, 16) != (1,):
         return False
     (table_offset,) = struct.unpack_from("<Q", code, 40)
@@ -173,7 +173,7 @@ EVALUATE_SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_int
 
 
 class PointEvaluator:
-    """Compiled function of parameters and a point, evaluated at several points by one call.
+    """A compiled function of parameters and a point, which is evaluated at many points by one call.
 
     The results are written to the same array by every call, so each thread needs an evaluator of its own.
 
@@ -212,7 +212,7 @@ class PointEvaluator:
 
 
 class _SeparateRoundingWriter(ProgramWriter):
-    """A writer that rounds products before it adds them, as NumPy does, so that equal products cancel."""
+    """A writer of programs that rounds products before it adds them, as NumPy does."""
 
     def fused_multiply_add(self, op, product_index, factors, terms) -> ir.Value:
         product = self.write_operation("mul", factors)
@@ -220,7 +220,7 @@ class _SeparateRoundingWriter(ProgramWriter):
 
 
 def _compile_evaluator(program: Program) -> MachineCode:
-    """Compile ``evaluate(parameters, points, results, count)``, which runs a program at each of ``count`` points."""
+    """Return the machine code of ``evaluate(parameters, points, results, count)``, a program at each point."""
     module = ir.Module("points")
     pointer = FLOAT64.as_pointer()
     function = ir.Function(module, ir.FunctionType(ir.VoidType(), [pointer, pointer, pointer, INT64]), "evaluate")

@@ -90,6 +90,7 @@ def test_a_turning_field_is_that_of_brmesolve(coupling, bloch):
     assert "NOT VALID" not in run.audit().verdict
 
 
+@pytest.mark.slow
 def test_three_levels_are_those_of_brmesolve():
     """Populations and coherences at t = 8 by QuTiP 5.3.1, with ``sec_cutoff=0.05``."""
     H0, H1 = np.diag([0.0, 1.0, 2.5]), np.array([[0.0, 0.2, 0.1], [0.2, 0.0, 0.3], [0.1, 0.3, 0.0]])

@@ -79,6 +79,7 @@ CASES = {
 }
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", CASES)
 def test_rounding_scale_of_a_function(name):
     """The scale is right up to a factor, as random errors are between 0.5 and 1."""

@@ -29,7 +29,7 @@ for_each_gradient = pytest.mark.parametrize("gradient", DISCRETE_GRADIENTS.value
 
 @pytest.mark.sampled(1)
 @for_each_gradient
-@pytest.mark.parametrize("distance", [3.0, 1.0, 0.3, 0.03, 1e-3, 1e-6, 1e-9, 1e-13])
+@pytest.mark.parametrize("distance", [3.0, 0.3, 1e-3, 1e-6, 1e-9, 1e-13])
 @given(seed=seeds)
 def test_identity_at_every_distance(gradient, distance, seed):
     """The identity dgrad . d = H(x + d) - H(x) holds to the rounding error of its right-hand side."""

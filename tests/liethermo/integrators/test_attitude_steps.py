@@ -13,6 +13,7 @@ TRIAXIAL = (3.0, 2.0, 1.0)
 SPINS = [(ISOTROPIC, (0.7, -1.1, 0.4)), (TRIAXIAL, (0.0, 0.0, 2.0)), (TRIAXIAL, (-1.3, 0.0, 0.0))]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("method", "engine"), [(METHODS[0], "array"), *((method, "compiled") for method in METHODS)], ids=str
 )

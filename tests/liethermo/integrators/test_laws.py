@@ -76,11 +76,8 @@ def law_cases():
 
 @pytest.mark.sampled(
     "so(3)-killing-MetriplecticRungeKutta(order=4)",
-    "sl(2)-projected-MetriplecticGauss(stages=2)",
-    "su(2)-projected_preserve-MetriplecticGauss(stages=1)",
     "heisenberg(1)-potential_power_law-MetriplecticMidpoint(gradient=Gonzalez)",
     "se(2)-inner_product-MetriplecticMidpoint(gradient=MeanValue)",
-    "su(2)-force-MetriplecticMidpoint(gradient=CoordinateIncrement(symmetric=True))",
 )
 @pytest.mark.parametrize(("g", "case", "method"), list(law_cases()))
 def test_every_algebra_dissipation_and_method(g, case, method):

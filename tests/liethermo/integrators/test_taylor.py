@@ -113,6 +113,7 @@ def test_observed_order_on_manifolds(name, order, length):
     assert_slope(errors, order)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rtol", "order"), [(1e-6, 8), pytest.param(1e-12, 15, marks=pytest.mark.slow)])
 def test_orders_from_tolerances_and_states_between(rtol, order):
     """The default order follows from the tolerance; the error is within it, also between the steps."""
@@ -190,6 +191,7 @@ def test_bad_input():
         lt.integrate(lawless, [1.0, 2.0], (0.0, 1.0), 0.1, Taylor(8))
 
 
+@pytest.mark.slow
 def test_without_a_tolerance_the_order_is_that_of_1e_10():
     """Every way to run uses this order."""
     assert Taylor().order == Taylor().on(BODY).order == Taylor().on(BODY, 1e-10).order == 13

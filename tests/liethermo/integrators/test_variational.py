@@ -238,7 +238,7 @@ def _slopes(errors):
     return np.log2(np.array(errors[:-1]) / errors[1:])
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", SCHEMES)
 @pytest.mark.parametrize("friction", [2.0, 10.0, 20.0], ids=["underdamped", "critical", "overdamped"])
 def test_orders_against_the_exact_solution(name, friction):

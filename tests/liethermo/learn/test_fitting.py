@@ -38,6 +38,7 @@ def test_numbers_are_found_by_matching_and_shooting():
     assert "matching" in str(matching_fit.training)
 
 
+@pytest.mark.slow
 def test_other_parameters_of_any_system_are_found():
     """Inertias and a rate of the relaxed rigid body. The sum of the 1/I moves nothing but through the friction."""
     body = lt.models.rigid_body((3.0, 2.0, 1.0), rate=0.2)
@@ -297,6 +298,7 @@ def test_an_observation_that_cannot_be_used_has_an_error_of_one_line(how, words)
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.slow
 def test_noise_with_a_unit_is_the_same_as_in_si_units():
     """The states of a table with units are in SI units, so ``"0.5 deg"`` is 0.0087 rad."""
     for noise, values in (("0.5 deg", np.pi / 360.0), (["0.5 deg", 0.01], [np.pi / 360.0, 0.01])):

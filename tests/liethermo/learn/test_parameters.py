@@ -41,6 +41,7 @@ def errors_of(training, expected):
     return (training.values - expected) / training.standard_errors
 
 
+@pytest.mark.slow
 def test_inertias_of_a_thrown_book_are_found_from_its_file(tmp_path):
     """From angular velocities alone, in deg/s at irregular times in ms; and they are those of SciPy."""
     table = sensors.thrown_book(1, **SHORT_MOTION)

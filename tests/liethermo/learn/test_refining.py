@@ -124,6 +124,7 @@ def test_the_defaults_find_it_within_two_standard_errors(guess, observed):
     assert np.sqrt(np.mean(np.square(errors))) < 2.0
 
 
+@pytest.mark.slow
 def test_three_rows_do_not_determine_it():
     """0.43 came without a word."""
     data = [(t[:3], x[:3]) for t, x in records(1)[:1]]
@@ -179,6 +180,7 @@ def test_noise_is_told_from_motion():
     assert estimate_noise_if_visible(rounded_data, np.ones(3)) is None
 
 
+@pytest.mark.slow
 def test_data_without_noise_can_be_said_to_be_exact():
     data = records(0)
     exact = lt.learn.fit(spring(0.5), data, positive=rate_of, noise=0, matching=100, shooting=0)

@@ -55,6 +55,7 @@ def test_a_tensor_is_the_body_in_turned_axes(name):
         assert np.allclose(f[3:], g[3:], atol=1e-14)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", BUILDERS)
 def test_what_is_no_tensor_is_refused_and_what_no_body_has_is_warned_of(name):
     asymmetric = np.diag(MOMENTS) + 0.1 * np.eye(3, k=1)

@@ -148,20 +148,6 @@ def test_a_rigid_body_has_no_joint_rates():
 # -- closed forms ---------------------------------------------------------------------------------------------------
 
 
-def test_two_bodies_on_a_hinge_through_their_centres_swing_with_the_reduced_inertia():
-    """Wheels on one axis with a torsion spring: ``omega^2 = k (1/J0 + 1/J1)``."""
-    J0, J1, k = 3.0, 0.5, 2.0
-    tree = lt.bodies.Tree()
-    tree.add("bus", 4.0, inertia=(2.0, 2.0, J0))
-    tree.add("rotor", 1.0, inertia=(0.4, 0.4, J1), parent="bus", joint=lt.bodies.Hinge((0, 0, 0), (0, 0, 2.0), k))
-    system = tree.system()
-    run = lt.integrate(system, system.state(joints={"rotor": 0.3}), (0.0, 4.0), 0.05, lt.MetriplecticGauss(4))
-    omega = np.sqrt(k * (1.0 / J0 + 1.0 / J1))
-    np.testing.assert_allclose(run.joints["rotor"], 0.3 * np.cos(omega * run.t), atol=1e-11)
-    angle = lt.bodies.euler_angles(run, "xyz")[:, 2]  # the bus turns back by J1 / (J0 + J1) of the joint angle
-    np.testing.assert_allclose(angle, J1 / (J0 + J1) * (0.3 - run.joints["rotor"]), atol=1e-11)
-
-
 def test_two_masses_on_a_slider_swing_with_the_reduced_mass():
     tree = lt.bodies.Tree()
     tree.add("bus", 4.0, inertia=(1.0, 1.0, 1.0))
@@ -412,6 +398,7 @@ def test_a_control_without_the_change_of_inertia_fails(reference):
     assert np.abs(run.y[3:, -1].reshape(3, 3) - reference[0]).max() > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parents", [range(8), (0, 0, 1, 1, 3, 4, 4, 0)], ids=["chain", "branches"])
 def test_larger_trees_beside_derivatives_of_the_places_of_their_bodies(parents):
     """``M = sum m D r^T D r + D w^T J D w`` less the linear momentum, r and w of each body from link to link."""

@@ -19,6 +19,7 @@ def start(q, seed=1, degrees=(1, 4)):
     return q.magnetic_state(q.random(seed, degrees, 4.0), q.random(seed + 1, degrees, 1.0))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("rate", [0.0, 0.05])
 def test_the_equations_are_the_documented_ones(rate):
     q = QuantisedSphere(8)

@@ -89,6 +89,7 @@ def test_a_damper_wheel_brings_the_body_to_its_spin():
     assert float(system.temperatures(run.x[-1])[0]) == pytest.approx(end, rel=1e-11)
 
 
+@pytest.mark.sampled("MetriplecticRungeKutta(order=6)-0.1")
 @pytest.mark.parametrize(
     ("method", "step"),
     [
@@ -123,6 +124,7 @@ def test_motors_turn_a_body_from_rest_without_momentum(method, step):
     assert run.audit().passed
 
 
+@pytest.mark.sampled("MetriplecticRungeKutta(order=4)")
 @pytest.mark.parametrize("method", [lt.MetriplecticRungeKutta(4), lt.MetriplecticRungeKutta(8)], ids=str)
 def test_wheels_turn_a_body_whose_momentum_nearly_cancels(method):
     """Corrections of the energy moved a small momentum of the whole by more than its length, and steps failed."""

@@ -224,7 +224,7 @@ def _rate(system, x):
     return system.vector_field(x)
 
 
-@pytest.mark.sampled(7)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("friction", FRICTIONS.values(), ids=FRICTIONS)
 @pytest.mark.parametrize("case", MASS_SPRING_CASES)
 def test_the_exact_solution_solves_the_equations(case, friction):

@@ -184,7 +184,7 @@ CASES = {
 }
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("with_wheels", [False, True], ids=["body", "wheels"])
 @pytest.mark.parametrize("name", CASES)
 def test_a_ready_torque_beside_an_integration_in_coordinates(name, with_wheels):
@@ -230,7 +230,7 @@ def test_a_lossy_torque_takes_the_energy_that_the_ledger_says(torque):
     assert solution.audit().passed
 
 
-@pytest.mark.sampled("rigid_body", "dual_spin")
+@pytest.mark.sampled("rigid_body")
 @pytest.mark.parametrize("model", ["rigid_body", "tumbling_body", "damper_wheel", "ring_damper", "dual_spin",
                                    "reaction_wheels"])  # fmt: skip
 def test_every_model_takes_torques_that_act_on_the_momentum_of_the_whole(model):
@@ -274,18 +274,6 @@ def test_the_attitude_of_a_body_with_three_wheels_beside_an_integration_in_coord
     assert solution.audit().passed
 
 
-def test_a_body_with_wheels_moves_alike_with_and_without_its_attitude():
-    velocity = {"angular_velocity": RATES, "rotor_rates": [1.0, -2.0, 0.5]}
-    runs = []
-    for attitude in (False, True):
-        system = lt.models.body_with_wheels((3.0, 2.0, 1.5), (0.3, 0.2, 0.1), attitude=attitude)
-        runs.append(lt.integrate(system, system.state(**velocity), (0.0, END), STEP, lt.MetriplecticGauss(3)))
-    plain, followed = runs
-    assert np.abs(lt.bodies.angular_velocity(plain) - lt.bodies.angular_velocity(followed)).max() < ACCURACY
-    momentum = np.einsum("tij,tj->ti", followed.attitude, followed.x[:, :3])
-    assert np.abs(momentum - momentum[0]).max() < 1e-14
-
-
 def test_reaction_wheels_with_one_wheel_are_a_damper_wheel():
     one = lt.models.reaction_wheels((2.0, 1.6, 1.0), [[0.0, 1.0, 0.0]], 0.1, 0.05)
     other = lt.models.damper_wheel((2.0, 1.6, 1.0), (0.0, 1.0, 0.0), 0.1, 0.05)
@@ -319,21 +307,22 @@ def test_a_rotation_of_a_vector_is_scipys():
     assert np.isfinite(jax.jacfwd(lambda t: rotate_by_vector(v, jnp.array([t, 0.0, 0.0])))(0.0)).all()
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("m", [2, 3, 4, 5, 8, 9, 17, 100])
 def test_tables_are_scipys_splines(m):
     rng = np.random.default_rng(m)
     t, y = np.sort(rng.uniform(0.0, 10.0, m)), rng.standard_normal((m, 3))
     q = np.concatenate([rng.uniform(t[0], t[-1], 100), t])
     linear = np.stack([np.interp(q, t, y[:, i]) for i in range(3)], axis=1)
-    assert np.abs(jax.vmap(T.Table(t, y))(q) - linear).max() < 2e-15
+    assert np.abs(jax.jit(jax.vmap(T.Table(t, y)))(q) - linear).max() < 2e-15
     splines = [scipy.interpolate.PchipInterpolator(t, y), scipy.interpolate.make_interp_spline(t, y, min(3, m - 1))]
     if m > 3:
         splines += [scipy.interpolate.CubicSpline(t, y), scipy.interpolate.Akima1DInterpolator(t, y),
                     scipy.interpolate.UnivariateSpline(t, y[:, 0], s=0.1)]  # fmt: skip
     for spline in splines:
         values = spline(q)
-        assert np.abs(jax.vmap(T.Table(spline))(q) - values).max() < 2e-14 * np.abs(values).max()
-    assert not np.any(jax.vmap(T.Table(t, y))(np.array([t[0] - 1e-9, t[-1] + 1e-9])))
+        assert np.abs(jax.jit(jax.vmap(T.Table(spline)))(q) - values).max() < 2e-14 * np.abs(values).max()
+    assert not np.any(jax.jit(jax.vmap(T.Table(t, y)))(np.array([t[0] - 1e-9, t[-1] + 1e-9])))
 
 
 test_bad_torques_are_refused = refusal_test(
@@ -384,17 +373,9 @@ def test_a_long_table_with_zeros_is_read_alike_by_both_engines():
     assert np.abs(ends[1] - INERTIA @ omega).max() < 1e-4  # kinks inside of steps
 
 
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("method", [lt.MetriplecticGauss(2), lt.MetriplecticRungeKutta(4), lt.MetriplecticTaylor(8)])
-def test_engines_agree_on_tables(method):
-    torque = [T.Tabulated(SPLINE), T.ConstantInSpace([0.0, 0.1, 0.0])]
-    ends = [run(torque, False, method=method, engine=engine)[1].x[-1] for engine in ("array", "compiled")]
-    assert np.abs(ends[0] - ends[1]).max() < 1e-13
-
-
 def test_torque_of_the_time_alone():
     """A function of t, a table and pulses are torques as they are; the pulses state their breaks."""
-    start, span, method = [0.3, -0.2, 0.9], (0.0, 3.0), lt.MetriplecticGauss(2)
+    start, span, method = [0.3, -0.2, 0.9], (0.0, 3.0), lt.MetriplecticMidpoint()
     pairs = [
         (lambda t: jnp.stack([0.0 * t, jnp.sin(t), 0.1 * t]), lambda t, mu: jnp.stack([0.0 * t, jnp.sin(t), 0.1 * t])),
         (lt.PiecewiseConstant([0.25, 1.1], [(0.0, 0.0, 0.1)]), T.PiecewiseConstant([0.25, 1.1], [(0.0, 0.0, 0.1)])),

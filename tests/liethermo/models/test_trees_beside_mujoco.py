@@ -62,6 +62,7 @@ def system_and_state(name):
     return system, system.state(angular_velocity=ANGULAR_VELOCITY, joints=joints, joint_rates=rates), names
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["three", pytest.param("ten", marks=pytest.mark.slow)])
 def test_joint_angles_attitude_energy_and_momentum(name):
     system, x0, joints = system_and_state(name)

@@ -291,6 +291,7 @@ def test_the_order_and_the_laws_of_the_method_hold_between_its_steps(case):
     assert errors[1] > 1e-12, "rounding tells nothing of an order"
 
 
+@pytest.mark.slow
 def test_control_the_cubic_between_has_an_order_of_its_own():
     """Control: the cubic Hermite interpolant of the steps has order 4, whatever the method."""
     system, (method, h), errors = system_of("so(3)"), METHODS["RK8"], []

@@ -146,6 +146,7 @@ def test_limits():
 # -- times and events -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_save_at(engine):
     times, x0s = [0.0, 0.37, 1.0, 1.05, 7.3], states(11)

@@ -318,6 +318,7 @@ def test_a_row_of_wells_leaves_its_rest():
     )
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", [lt.MetriplecticRungeKutta(8), lt.MetriplecticGauss(3)], ids=str)
 @pytest.mark.parametrize("n_bodies", [2, 3])
 def test_the_clock_of_a_driven_system_does_not_grow(method, n_bodies):

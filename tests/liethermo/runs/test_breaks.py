@@ -78,6 +78,7 @@ def test_thruster_pulses_are_integrated_to_the_tolerance(body, reference, method
     assert np.isin(SWITCHES, solution.t).all()
 
 
+@pytest.mark.slow
 def test_both_engines_and_ensembles_see_the_pulses_alike(body, reference):
     method = lt.MetriplecticRungeKutta(8)
     for step in (0.1, lt.Adaptive(1e-9)):
@@ -123,6 +124,7 @@ def test_flow_has_the_states_and_derivatives_of_the_run(body, reference):
     np.testing.assert_allclose(derivative, np.transpose(difference), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_dense_output_on_both_sides_of_a_switch(body):
     solution = lt.integrate(body, X0, (0.0, 3.0), lt.Adaptive(1e-11), lt.MetriplecticRungeKutta(8), dense=True)
     fine = lt.integrate(body, X0, (0.0, 3.0), 0.05, lt.MetriplecticRungeKutta(8))
@@ -188,7 +190,7 @@ def switched_energy(is_right_continuous):
     return damped_body(energy)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled("Gauss-False")
 @pytest.mark.parametrize("is_right_continuous", [True, False])
 @pytest.mark.parametrize(
     ("method", "step", "max_error"),
@@ -214,7 +216,7 @@ def test_a_run_in_parts_that_end_at_the_switches(switched_reference, method, ste
     assert abs(sum(jumps) - switched_reference[1]) < max_error
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("method", "step", "max_error"), METHODS, ids=str)
 def test_pulses_that_start_and_end_with_the_span(body, method, step, max_error):
     """One step too many, such as those that shrink towards the end, would be seen in the sizes of the steps."""

@@ -331,7 +331,7 @@ RIGID = lt.LiePoissonSystem(
 
 
 def test_events_of_attitude_parameters_and_system():
-    arguments = [0.5, 0.9, 1.0], (0.0, 20.0), lt.Adaptive(1e-10), lt.MetriplecticRungeKutta(8)
+    arguments = [0.5, 0.9, 1.0], (0.0, 20.0), lt.Adaptive(1e-10), lt.MetriplecticRungeKutta(4)
     run = lt.integrate(RIGID, *arguments, until=lambda x, attitude: attitude[2, 2] - 0.3)
     assert run.attitude[-1, 2, 2] == pytest.approx(0.3, abs=1e-15)
     rates = np.array([0.1, 0.2, 0.3])

@@ -19,9 +19,9 @@ METHODS = [m for m in lt.registered_methods() if isinstance(m, METRIPLECTIC_METH
 
 
 def methods_with(names) -> list:
-    """Return methods with names of systems: each method, and each class of methods with each system."""
+    """Return methods with names of systems: each method, and each system with a method of each kind."""
     cases = [pytest.param(method, name, id=f"{method}-{name}") for name in names for method in METHODS]
-    return covering(cases, lambda method, name: [(type(method), name), str(method)])
+    return covering(cases, lambda method, name: [(method.explicit, name), str(method)])
 
 
 def jacobian_by_differences(f, x, size=2e-3):
@@ -249,7 +249,7 @@ def test_all_states_of_a_path(build, order):
     assert np.abs(expected[-1]).max(axis=0).min() > 1e-3 if order == 1 else np.abs(expected[-1]).max() > 0.1
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("method", IMPLICIT, ids=str)
 def test_every_method(method):
     """Alone by the parameters, then by the state: what does not move is no direction."""

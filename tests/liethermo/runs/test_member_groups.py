@@ -63,7 +63,7 @@ def test_members_are_as_if_alone(method):
     assert ensemble[0].audit().passed
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [lt.MetriplecticMidpoint(), lt.MetriplecticRungeKutta(6)], ids=str)
 def test_adaptive_steps_and_saved_times(method):
     options = {"parameters": {"a": A}, "save_at": [0.5, 2.0]}
@@ -114,6 +114,7 @@ def test_a_flow_under_vmap(method):
     assert np.abs(jax.jit(jax.vmap(end))(jnp.asarray(A)) - single_flows).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_a_control_one_verdict_for_all_is_found(monkeypatch):
     """Control: with what the first member conserves held for all, the relation of company fails."""
 

@@ -103,6 +103,7 @@ def test_a_noisy_run_goes_on_from_a_file(tmp_path):
     assert np.array_equal(rest.attitude, whole_run.attitude[13:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["compiled", pytest.param("array", marks=ARRAY)])
 def test_a_noisy_ensemble_in_parts(engine):
     starts = np.random.default_rng(0).standard_normal((11, 3))
@@ -140,6 +141,7 @@ def test_a_driven_noisy_run_in_parts_is_the_run_to_rounding():
     )
 
 
+@pytest.mark.slow
 def test_a_loop_of_short_noisy_runs_has_the_mean_of_equilibrium():
     """The mean over 2,000 runs is <s3> = coth(1) - 1 for a spin in a field of one temperature."""
     system, noise = lt.models.single_spin(1.0, 0.5, baths=lt.HeatBaths(np.inf, 1.0)), lt.Fluctuations(seed=5)
@@ -205,6 +207,7 @@ def test_parts_have_the_steps_of_the_run_however_late_they_are(step, steps):
         assert np.isclose(part.last_step_size, 0.25 * step, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_noisy_loop_of_single_steps_at_late_times():
     """Each of its parts is one step of the run, at whatever time."""
     whole_run = lt.integrate(body(), START, (0.0, 1100.0), 0.1, noise=NOISE)

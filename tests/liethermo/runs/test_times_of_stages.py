@@ -98,6 +98,7 @@ def test_members_of_an_ensemble_are_single_runs_to_the_bit(step, engine):
         assert np.array_equal(ensemble.x[i], one) if engine == "compiled" else np.abs(ensemble.x[i] - one).max() < 1e-14
 
 
+@pytest.mark.slow
 def test_a_flow_and_its_derivative():
     def end(x):
         return lt.flow(forced_oscillator(), x, SPAN, STEP, lt.MetriplecticGauss(2))

@@ -253,12 +253,17 @@ def test_the_two_orders():
     np.testing.assert_array_equal(spins_to_site_order(spins_to_component_order(np.stack([x, -x]), 4), 4), [x, -x])
 
 
+@pytest.mark.slow
 def test_control_a_wrong_order_is_seen():
     """Steps from a state in the other order, taken for one that is not."""
     system = ring()
     found_values = reorder_spins(system)
     first = initial_run_state_program(system, lt.MetriplecticMidpoint(), jnp.asarray(system.state(unit(N_LARGE))))
-    right = array_engine.advance(system, lt.MetriplecticMidpoint(), first, *map(jnp.asarray, (0.05, 1, 1)), 1)[0]
+    right = array_engine.take_steps_and_save(
+        system, lt.MetriplecticMidpoint(), first, *map(jnp.asarray, (0.05, 1, 1)), 1
+    )[0]
     wrong = first._replace(x=found_values.reorder_state(first.x))
-    other = array_engine.advance(system, lt.MetriplecticMidpoint(), wrong, *map(jnp.asarray, (0.05, 1, 1)), 1)[0]
+    other = array_engine.take_steps_and_save(
+        system, lt.MetriplecticMidpoint(), wrong, *map(jnp.asarray, (0.05, 1, 1)), 1
+    )[0]
     assert np.abs(right.x - found_values.restore_state(other.x)).max() > 1e-3

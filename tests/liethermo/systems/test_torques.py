@@ -322,7 +322,7 @@ INTERNAL = {
             for torque, name in itertools.product(INTERNAL, METHODS)
             for how, step in {"0.5": 0.5, "adaptive": lt.Adaptive(1e-6)}.items()
         ),
-        lambda torque, name, step: [(torque, type(METHODS[name])), (torque, step == 0.5), (name, step == 0.5)],
+        lambda torque, name, step: [(torque, type(METHODS[name])), (name, step == 0.5)],
     ),
 )
 def test_an_internal_torque_leaves_the_momentum_in_space(torque, name, step):
@@ -460,7 +460,7 @@ def test_a_flow_is_differentiated_by_a_parameter():
 
 def test_files_provenance_and_dense_output(tmp_path):
     system = rubbing(TORQUES["gravity gradient"])
-    run = lt.integrate(system, START, SPAN, lt.Adaptive(1e-8), METHODS["gauss2"], dense=True, engine="compiled")
+    run = lt.integrate(system, START, SPAN, lt.Adaptive(1e-8), METHODS["gauss2"], dense=True, engine="array")
     assert run.provenance["torque"] == "GravityGradient"
     assert run.provenance["dissipation"] == type(system.dissipation).__name__
     assert run.provenance["system"] == "LiePoissonSystem"

@@ -83,7 +83,7 @@ def top_with_preserved_casimir():
 # -- all of them hold -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled("an entropy known near the motion")
 @pytest.mark.parametrize(
     ("make", "x0", "method", "step", "time", "relations"),
     [
@@ -218,6 +218,7 @@ def test_noise_that_repeats_is_found(monkeypatch):
             check(2)
 
 
+@pytest.mark.sampled("midpoint")
 @pytest.mark.parametrize("method", ["midpoint", "explicit 4"])
 def test_split_runs_of_driven_systems(method):
     """Segments of a split run start at their own times; a torque depends on time and attitude."""

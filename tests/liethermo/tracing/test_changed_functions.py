@@ -207,7 +207,7 @@ def untraced_copy(function):
     return types.FunctionType(function.__code__, function.__globals__, function.__name__)
 
 
-@pytest.mark.sampled(10)
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", USES)
 def test_changed_globals_take_effect(monkeypatch, name):
     function, use = USES[name]

@@ -221,7 +221,7 @@ def symbols(dim):
     return sympy.symbols(f"e1:{dim + 1}", real=True)
 
 
-@pytest.mark.sampled(10)
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("name", LITERATURE_INVARIANTS)
 def test_published_invariants_are_annihilated_and_complete(name):
     g, variables = member(name), symbols(int(name[1]))

@@ -64,7 +64,7 @@ def G(request):
 # -- every registered group: exp, log, products -----------------------------------------------------------------------
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @given(seed=seeds)
 def test_exp_lands_in_the_group(G, seed):
     for size in (1e-3, 1.0, 3.0):
@@ -324,7 +324,7 @@ def test_the_logarithm_at_a_half_turn_of_an_affine_motion():
 # -- every registered group: what is refused --------------------------------------------------------------------------
 
 
-@pytest.mark.sampled(7)
+@pytest.mark.sampled(3)
 def test_off_the_group(G):
     g = np.array(G.exp(elements(G, 10)))
     if G.name.startswith("GL"):
@@ -553,6 +553,11 @@ def test_a_defect_of_one_matrix_is_applied_to_each(defect):
     g = np.stack([np.eye(2), 2.0 * np.eye(2), np.diag([2.0, 0.5])])
     assert group.belongs(g).tolist() == [True, False, True]
     assert group == mf.MatrixGroup("mine", mf.sl(2), defect)
+
+
+def test_a_defect_with_an_index_out_of_range_is_refused():
+    with pytest.raises(IndexError, match="defect of the group mine has the index 2 of an axis with 2 entries"):
+        mf.MatrixGroup("mine", mf.sl(2), lambda g: jnp.abs(g[1, 1] * g[2, 2] - 1.0))
 
 
 @pytest.mark.parametrize(

@@ -165,7 +165,7 @@ def test_tangent_vectors(S, seed):
     assert is_close(S.project_tangent(x, tangent_part), tangent_part, *tolerance)
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(2)
 @given(seed=seeds)
 def test_metric(S, seed):
     x, alpha = random_points(S, seed), ambient_arrays(S, seed)
@@ -232,6 +232,7 @@ def test_parallel_transport(S, seed):
         assert is_close(tu_in_two_steps, tu, tolerance[0], 4 * tolerance[1] ** 2)
 
 
+@pytest.mark.sampled(4)
 @given(seed=seeds)
 def test_midpoints(S, seed):
     skip_without_geodesics(S)
@@ -315,6 +316,7 @@ def test_every_space_has_a_twin_or_a_reason():
     assert not extra, f"no such space is registered: {sorted(extra)}"
 
 
+@pytest.mark.sampled(4)
 def test_geomstats_agrees(S):
     if S.name not in TWINS:
         pytest.skip(REASON_FOR_NO_TWIN.get(S.name, "it is in neither list, which another test reports"))

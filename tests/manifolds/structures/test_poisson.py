@@ -20,7 +20,7 @@ def functions(n, seed):
     return (lambda x: jnp.sin(a @ x)), (lambda x: (b @ x) ** 2), (lambda x: jnp.exp(c @ x / 2))
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(2)
 @each_structure
 @given(seed=seeds)
 def test_axioms(P, seed):
@@ -72,6 +72,7 @@ def test_a_tensor_of_ones_own():
 LEAVES = [mf.LiePoisson(mf.su(3)), mf.LiePoisson(mf.so(5)), mf.LiePoisson(mf.u(2)), mf.DensityMatrices(3)]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("P", LEAVES, ids=lambda P: f"{type(P).__name__}-{P.dim}")
 def test_stages_on_a_leaf(P):
     """The spectrum is conserved for any covectors and long steps; the control has stages off the leaf."""

@@ -33,7 +33,7 @@ def direct_energy(positions, moments, spins):
     return total
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("name", "cells"), [("chain", 7), ("kagome", (3, 2)), ("sc", (3, 2, 4)), ("bcc", (2, 3, 2))])
 def test_open_lattices_are_direct_sums(name, cells):
     crystal = mag.lattice(name, cells, constant=1.3, periodic=False)
@@ -187,7 +187,7 @@ def test_periodic_energies_are_sums_over_images(periodic):
         assert float(twice(copies)) == pytest.approx(2.0 * float(energy(s)), rel=1e-13)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled("True")
 @pytest.mark.parametrize("few", [True, False])
 def test_dipoles_keep_both_laws(few):
     crystal = mag.lattice("square", (4, 4), periodic=(True, False))

@@ -196,7 +196,7 @@ CASES = [
 ]
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "engine"), CASES)
 def test_every_term_keeps_both_laws(name, engine):
     crystal = mag.lattice("honeycomb", (2, 2), periodic=False)
