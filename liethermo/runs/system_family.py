@@ -362,8 +362,8 @@ def broadcast_size(*sizes: int) -> int:
     distinct_sizes = {size for size in sizes if size != 1}
     if len(distinct_sizes) > 1:
         raise InputError(
-            f"initial states, attitudes and parameters are for {' and '.join(map(str, sorted(distinct_sizes)))} "
-            "trajectories. Give one of each for all trajectories, or equal numbers"
+            "initial states, attitudes and parameters are for different numbers of trajectories, "
+            f"{sorted(distinct_sizes)}. Give equal numbers, or one for all trajectories"
         )
     if 0 in distinct_sizes:
         raise InputError("an ensemble needs at least one trajectory, got 0 initial states or sets of parameters")
