@@ -127,7 +127,7 @@ OUTSIDE_MODEL_VERDICT = "; THE EQUATIONS ARE USED WHERE THEY ARE NOT VALID"
 """End of the verdict of an audit in which a condition of the model does not hold."""
 
 UNPROMISED_NOTE = "no law promised"
-"""Note of the energy or the entropy where the system or the method promises nothing about it."""
+"""Note in the row of the energy or the entropy if the system or the method promises nothing about it."""
 
 LAW_FAILURE_VERDICT = "A LAW FAILS"
 """Verdict of an audit in which a law is violated."""
@@ -195,6 +195,7 @@ class Audit(Tabular):
 
     @property
     def _verdict_on_run(self) -> str:
+        """Summary of the rows that judge the run, without those that judge the validity of the model."""
         violated_rows = {row.law for row in self.rows if row.passed is False and not row.concerns_model}
         if violated_rows - {ACCURACY_ROW, CONSISTENCY_ROW, STEPS_TAKEN_ROW, FAILED_TRAJECTORIES_ROW}:
             return LAW_FAILURE_VERDICT

@@ -1,4 +1,4 @@
-"""Evidence for the audit of a result: numbers beside its series, computed when they are first asked for.
+"""Evidence for the audit of a result: numbers besides its time series, computed when they are first needed.
 
 See :mod:`liethermo.runs.evidence` for the computation.
 """

@@ -200,6 +200,7 @@ class Ensemble(AuditableResult):
         return (self[i] for i in range(len(self)))
 
     def _checked_member_index(self, i) -> int:
+        """Return i as an index from 0; raise InputError or IndexError if there is no such trajectory."""
         if isinstance(i, bool) or not isinstance(i, int | np.integer):
             raise InputError(f"the index of a trajectory must be an integer, got {i!r}")
         if not -len(self) <= i < len(self):
@@ -278,6 +279,8 @@ class Ensemble(AuditableResult):
         )
 
     def _member_velocity_sources(self, i: int, is_reached: np.ndarray) -> dict[str, Callable[[], np.ndarray]]:
+        """Return functions that compute the velocities of trajectory i at its saved times, by name."""
+
         def velocities(name: str) -> np.ndarray:
             return self.velocity_sources[name]()[i][is_reached]
 

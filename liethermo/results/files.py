@@ -20,7 +20,7 @@ from .orientation import angular_velocity, euler_angles, quaternions
 from .solution import Solution
 
 QUATERNION_COLUMNS = ("q_x", "q_y", "q_z", "q_w")
-"""Names of the columns of quaternions, by which their order in a file does not matter."""
+"""Names of the columns of quaternions; a file may have them in any order."""
 
 RATE_COLUMNS = tuple(f"omega_{axis}" for axis in "xyz")
 """Names of the columns of the angular velocity in body axes, before their unit."""

@@ -392,6 +392,7 @@ def orientation_series_by_name(solution: AuditableResult) -> dict[str, np.ndarra
 
 
 def _require_rotation_matrices(solution: AuditableResult) -> np.ndarray:
+    """Return the attitudes of a result, shape (..., 3, 3); raise InputError if it has none in SO(3) or SE(3)."""
     if not isinstance(solution, AuditableResult):
         raise InputError(f"attitudes need a solution or an ensemble, got {solution!r:.60}")
     if solution.attitude is None:
@@ -405,6 +406,7 @@ def _require_rotation_matrices(solution: AuditableResult) -> np.ndarray:
 
 
 def _require_angular_momenta(solution: AuditableResult) -> np.ndarray:
+    """Return the first three components of the states, shape (..., 3); raise InputError unless these are on so(3)*."""
     if solution.x is None:
         raise InputError('no states were kept: run the ensemble with outputs="final" or "trajectory"')
     if not str(solution.provenance.get("algebra", "")).startswith("so(3)"):

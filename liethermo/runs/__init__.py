@@ -1,1 +1,1 @@
-"""Runs: ``integrate``, ``ensemble`` and ``flow``, the steps that they take and the times that they keep."""
+"""Runs: ``integrate``, ``ensemble`` and ``flow``, the steps that they take and the states that they save."""

@@ -28,7 +28,7 @@ TARGET_ATTEMPTS_PER_CALL = 2**15
 
 
 RUNNING_CODES = (StatusCode.COMPLETED, StatusCode.PAUSED_AT_STOP, StatusCode.PAUSED_FOR_GROWTH_RATE)
-"""Status codes of trajectories that go on."""
+"""Status codes of trajectories that have not ended."""
 
 
 class AdaptiveEnsembleRun(EnsembleRun):
@@ -170,6 +170,7 @@ class _BatchRecorder:
             self._record_final_fields(indices, np.full(indices.size, StatusCode.INTERRUPTED))
 
     def _record_final_fields(self, indices: np.ndarray, status_codes: np.ndarray) -> None:
+        """Record the outcome of the trajectories with these indices in the batch."""
         runs, members = self.runs, self.members[indices]
         initial = {name: values[indices] for name, values in self.initial.items()}
         final = {name: runs.read(name, indices) for name in REPORTED_FIELDS}

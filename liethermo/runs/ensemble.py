@@ -333,6 +333,7 @@ def _find_invalid_rows_by_bisection(error_of_rows: Callable[[slice], str], n_row
     reasons: dict[int, str] = {}
 
     def bisect_rows(start: int, stop: int) -> None:
+        """Record the errors of the invalid rows from ``start`` up to ``stop``."""
         text = error_of_rows(slice(start, stop))
         if text and stop - start == 1:
             reasons[start] = text

@@ -31,7 +31,7 @@ ARRAY_BATCH_SIZE = 65_536
 """Largest number of trajectories that the array engine runs at once, which bounds memory."""
 
 ARRAY_MAX_SAVED_VALUES = 2**26
-"""Approximate number of state components that one call of the array engine saves at most."""
+"""Approximate upper limit of the number of state components that one call of the array engine saves."""
 
 RECORDED_INITIAL_FIELDS = ("x", "energy", "entropy")
 """Fields of the initial engine states that a record needs; of final states it needs
@@ -183,6 +183,7 @@ class FixedEnsembleRun(EnsembleRun):
         record, group, first_save = self.record, self.group, 1
 
         def record_call(engine_call: EngineCall, first_step: int, saved_states: np.ndarray) -> bool:
+            """Store the saved states of an engine call; return False if the user has interrupted the run."""
             nonlocal first_save
             if engine_call.are_states_saved:
                 record.store_consecutive_saves(members, first_save, saved_states)

@@ -231,6 +231,7 @@ def event_arguments(argument_names: Sequence[str], system: System, t, x) -> tupl
 
 
 def _event_argument_by_name(name: str, system: System, t, x):
+    """Return the time, the attitude, the parameters in one array, or for any other name the user's state."""
     if name == "t":
         return jnp.asarray(t, dtype=jnp.float64)
     if name == "attitude":
@@ -296,7 +297,7 @@ def _trace_event_function(
 
 
 def check_result_is_scalar(result, function_name: str) -> None:
-    """Raise FunctionError unless the result of a function is an array of shape ()."""
+    """Raise FunctionError unless the result of a user's function is a number, an array of shape ()."""
     shape = getattr(result, "shape", None)
     if shape != ():
         description = type(result).__name__ if shape is None else f"shape {shape}"

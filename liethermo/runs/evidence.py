@@ -1,7 +1,7 @@
 """Evidence for audits: rounding scales of functions, and steps that are repeated from the states of a result.
 
-One checker judges the steps of a single run and those of an ensemble; engines repeat the steps. All is computed when it
-is first asked for, at a bounded number of states.
+One checker judges the steps of a single run and those of an ensemble; engines repeat the steps. The evidence is
+computed when it is first needed, at a bounded number of states.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ MAX_LOCAL_ERROR_VALUES = 2_000
 """Largest number of components in the states of all repeated steps; but at least four steps are repeated."""
 
 CONSISTENCY_STATES = 3
-"""Number of states at which short steps are compared with the vector field, besides one of each other trajectory."""
+"""Number of states at which short steps are compared with the field, in addition to one state of each trajectory."""
 
 STEP_REFINEMENTS = 7
 """Number of short steps from each of these states, each an eighth of the one before."""
@@ -58,7 +58,7 @@ SHORT_STEP_FRACTION = 1e-3
 """Size of the first short step, as a fraction of the time in which the state changes by its norm."""
 
 MIN_MOTION_FRACTION = 0.01
-"""Fraction of the extent of the whole motion below which the length of a step counts as this fraction.
+"""Smallest length relative to which the error of a step is judged, as a fraction of the extent of the whole motion.
 
 A body that has come to rest may take long steps.
 """
@@ -75,7 +75,7 @@ SMALLEST_NORMAL = float(np.finfo(float).tiny)
 """Smallest positive normal float64."""
 
 CONSISTENCY_SKIP_LEVEL = 1e-6
-"""Inconsistency up to which the rounding of the vector field need not be traced, which takes as long as all else."""
+"""Inconsistency below which the rounding of the vector field is not traced, which takes as long as all other checks."""
 
 MIN_RELATIVE_MOTION = 1e-12
 """Relative displacement below which a step is ignored, because it consists of rounding."""
@@ -456,6 +456,7 @@ class RunEvidenceSource:
 
     @functools.cached_property
     def _evidence(self) -> Evidence:
+        """Evidence of the run, computed at its first use."""
         functions = {**energy_and_entropy_by_name(self.system), **self.functions}
         sample_indices = evenly_spaced_indices(len(self.saved_states), MAX_SENSITIVITY_STATES)
         sampled_x, guarantees = self.saved_states[sample_indices], frozenset(self.method.preserves)

@@ -276,6 +276,7 @@ def _states_at_times_by_newton_if_needed(
 def _solve_states_at_times(
     system, method, path_states, path_times, requested_times, span: tuple[float, float], uses_newton: bool
 ) -> jax.Array:
+    """Return the states at the requested times, shape (times, n), NaN where a step could not be solved."""
     solve = solve_stages_or_nan if uses_newton else iterate_fixed_point_or_nan
 
     def end_state(system, method, x, h):

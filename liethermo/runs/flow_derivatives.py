@@ -1,5 +1,4 @@
-"""Derivatives of any order of a path whose steps are solved: of each step along directions, then accumulated over
-steps.
+"""Derivatives of any order of the states of a path, accumulated from the derivatives of its solved steps.
 
 A step maps ``z = (x, p)``, the state and the parameters, to the next state by the slopes k that solve its equations:
 
@@ -73,6 +72,7 @@ def _nest_vmaps(function: Callable, vmap_axes: Sequence[tuple]) -> Callable:
 
 
 def _abstract_solution(*arguments, vmap_axes: tuple, **_):
+    """Return shape and type of the solution: the axes of all enclosing ``vmap``, then those of the guess."""
     shape, guess = arguments[-1].shape, arguments[-1]
     sizes = []
     for axes_of_level in reversed(vmap_axes):
@@ -94,6 +94,7 @@ def _batching_rule(arguments, dims, *, vmap_axes: tuple, **other_parameters):
 
 
 def _jvp_rule(primals, tangents, *, residual: Callable, structure, vmap_axes: tuple, **other_parameters):
+    """Return the solution and its tangent, by the implicit function theorem."""
     k = _implicit_solution.bind(
         *primals, residual=residual, structure=structure, vmap_axes=vmap_axes, **other_parameters
     )

@@ -285,6 +285,7 @@ class _MemberInvariantTests:
         test_time_index: int | None,
         use_nearby_states: bool,
     ) -> np.ndarray:
+        """Return verdicts on functions of each member, shape (B, n_functions), at one test time of driven members."""
         n_members, member = len(self.states), self.member
         if not n_functions:
             return np.zeros((n_members, 0), dtype=int)
@@ -293,7 +294,10 @@ class _MemberInvariantTests:
         def judge_at_states(
             member_indices: np.ndarray, states_of_members: Callable[[np.ndarray], np.ndarray], n_states: int
         ) -> None:
+            """Mark the functions of these members that are defined, or not conserved, at one of ``n_states`` states."""
+
             def judge_members(member_indices: np.ndarray) -> np.ndarray:
+                """Return whether each function is defined and whether it is violated; shape (members, 2, functions)."""
                 judgement = judge_conservation(
                     self._evaluate_at_member_points(
                         rates_of_functions,
@@ -309,19 +313,20 @@ class _MemberInvariantTests:
                 )
 
             if member_indices.size:
-                result = self._evaluate_in_batches(judge_members, n_states * member.dim, member_indices)
-                is_defined[member_indices] |= result[:, 0]
-                is_violated[member_indices] |= result[:, 1]
+                defined_and_violated = self._evaluate_in_batches(judge_members, n_states * member.dim, member_indices)
+                is_defined[member_indices] |= defined_and_violated[:, 0]
+                is_violated[member_indices] |= defined_and_violated[:, 1]
 
-        random = random_test_states(member, n_test_states_per_scale(member))
-        for points in (random[:1], random[1:]):  # one state is enough to see that a function is not conserved
-            open_members = np.flatnonzero(~is_violated.all(axis=1))
-            judge_at_states(open_members, functools.partial(self._rescaled_points_per_member, points), len(points))
+        sample_points = random_test_states(member, n_test_states_per_scale(member))
+        # one state is enough to see that a function is not conserved
+        for points in (sample_points[:1], sample_points[1:]):
+            undecided_members = np.flatnonzero(~is_violated.all(axis=1))
+            judge_at_states(undecided_members, functools.partial(self._rescaled_points_per_member, points), len(points))
         if use_nearby_states:
-            open_members = np.flatnonzero(~(is_defined | is_violated).all(axis=1))
+            undecided_members = np.flatnonzero(~(is_defined | is_violated).all(axis=1))
             n_states = len(states_near(member, self.states[0]))
             judge_at_states(
-                open_members, lambda rows: np.stack([states_near(member, x) for x in self.states[rows]]), n_states
+                undecided_members, lambda rows: np.stack([states_near(member, x) for x in self.states[rows]]), n_states
             )
         return np.where(is_violated, VERDICT_NOT_CONSERVED, np.where(is_defined, VERDICT_CONSERVED, VERDICT_UNKNOWN))
 

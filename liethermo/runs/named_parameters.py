@@ -22,10 +22,10 @@ from ..systems import System
 from ..tracing.caching import memoize
 
 WRAPPER_FIELDS = frozenset({"body", "part", "term", "function", "phi", "contact", "first"})
-"""Fields of the objects of a system that hold the object of the user, and are left out of names."""
+"""Fields of the library's wrapper objects that hold a user's object; names of parameters leave them out."""
 
 DERIVED_FIELDS = frozenset({"momentum_maps", "momentum_casimirs", "subsystems"})
-"""Fields of a system that follow from others. Their arrays have no names, but those of a Lagrangian in them."""
+"""Fields of a system that are computed from others; their arrays have no names, except those of a Lagrangian."""
 
 
 class NamedParameter(NamedTuple):
@@ -105,26 +105,26 @@ def replace_parameters(system: System, parameter_values: Mapping[str, Any]) -> S
     return ProgramStructure.from_module(system).rebuild(leaves)
 
 
-def reasons_of_refused_members(system: System, parameter_values: Mapping[str, Any]) -> dict[int, str]:
-    """Return the members of a family with a value that the constructor of its object refuses, with the reasons.
+def reasons_of_refused_members(system: System, member_values: Mapping[str, Any]) -> dict[int, str]:
+    """Return the reasons why constructors refuse the parameter values of some members of a family, by member index.
 
     Members with NaN are left out: the family has a reason for them.
 
     Parameters
     ----------
     system : System
-    parameter_values : mapping of str to array, shape (members, ...)
+    member_values : mapping of str to array, shape (members, ...)
     """
     reasons: dict[int, str] = {}
-    for name, value in parameter_values.items():
+    for name, value in member_values.items():
         condition = require_parameter(system, name).condition
         if condition is not None:
             reasons |= condition.violations(np.asarray(value, dtype=np.float64))
     return reasons
 
 
-def _condition_at(system: System, path: Sequence[Any]) -> ParameterCondition | None:
-    """Return the condition of the field of a system that holds the array at a path; None if it has none."""
+def _condition_at_path(system: System, path: Sequence[Any]) -> ParameterCondition | None:
+    """Return the condition of the field of a system that holds the array at a path; None if the field has none."""
     ends = [i for i, key in enumerate(path) if isinstance(key, GetAttrKey)]
     return condition_of_field(_node_at(system, path[: ends[-1]]), path[ends[-1]].name) if ends else None
 
@@ -203,7 +203,7 @@ def _parameters_by_name_and_by_path(system: System) -> tuple[dict[str, NamedPara
     fields = [[jax.tree_util.keystr((key,)).removeprefix(".") for key in path] for path, _ in paths_and_leaves]
     paths = [jax.tree_util.keystr(path).removeprefix(".") for path, _ in paths_and_leaves]
     arrays, has_derived_energy = parameter_arrays(system), _has_derived_energy(fields)
-    conditions = [_condition_at(system, path) for path, _ in paths_and_leaves]
+    conditions = [_condition_at_path(system, path) for path, _ in paths_and_leaves]
     leaves_by_name: dict[str, list[int]] = {}
     for i, path_fields in enumerate(fields):
         is_of_lagrangian = "lagrangian" in path_fields

@@ -314,10 +314,11 @@ def _random_key_of_steps(run_step_code: int, halvings: int, high_word: int) -> t
 
 
 MEASURE_ROW = "the motion keeps the measure"
-"""Name of the row of a report on the conservation of the measure."""
+"""Name of the report row that judges the conservation of the measure."""
 
 
 def _noise_and_measure_residuals(model: tuple[System, Energy | None], x):
+    """Return the residuals of the noise factor and of the conservation of the measure at x, by name."""
     system, density = model
 
     def motion(y):
@@ -366,6 +367,7 @@ DEFAULT_NOISE_METHOD = MetriplecticMidpoint()
 
 
 def _require_nonnegative_number(name: str, value) -> None:
+    """Raise InputError unless a value is a finite number >= 0."""
     try:
         number = float(value)
     except (TypeError, ValueError):

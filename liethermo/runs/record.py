@@ -216,6 +216,7 @@ class EnsembleRecord:
         }
 
     def _compute_velocities(self, velocity_name: str) -> np.ndarray:
+        """Return one kind of velocity of all trajectories, NaN for those in no group."""
         velocities, trajectory_numbers = zip(
             *(
                 (group_record.compute_velocities(velocity_name), group_record.trajectory_numbers)

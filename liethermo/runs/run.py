@@ -154,6 +154,7 @@ class Run:
         self.step, unsaved_steps = step, None
 
         def handle_accepted_steps(accepted_steps: AcceptedSteps):
+            """Save the states of accepted steps that the schedule or ``save_every`` asks for, and update the bar."""
             nonlocal unsaved_steps
             ends = accepted_steps.t[1:]
             is_saved = np.isin(ends, saved_stop_times)
@@ -206,6 +207,7 @@ class Run:
                 self.status = dataclasses.replace(self.status, message=text)
 
     def _save_accepted_steps(self, accepted_steps: AcceptedSteps, selection: np.ndarray | slice) -> None:
+        """Save the states of the accepted steps that ``selection`` selects."""
         self._append_saved_states(
             accepted_steps.t[1:][selection],
             accepted_steps.x[selection],
@@ -215,6 +217,7 @@ class Run:
     def _save_states_of_call(
         self, saved_states: SavedStates, first_step: int, steps_per_save: int, are_states_saved: bool
     ) -> None:
+        """Save the states of an engine call; with dense output, all states are kept besides."""
         if self.all_states is not None:
             step_counts = first_step + steps_per_save * np.arange(1, len(saved_states.x) + 1)
             times = self.schedule.times_after(step_counts)
@@ -228,6 +231,7 @@ class Run:
             self._append_saved_states(times, saved_states.x, saved_states.energy_and_entropy)
 
     def _append_saved_states(self, times: np.ndarray, states: np.ndarray, energies_entropies: np.ndarray) -> None:
+        """Append states, shape (saves, n), to the saved ones, with times and with energies and entropies."""
         self.n_saved += len(times)
         self.saved_times.append(times)
         self.saved_states.append(states)
@@ -302,6 +306,7 @@ class Run:
         )
 
     def _dense_output(self) -> DenseOutput | None:
+        """Return the dense output of the run, or None if the states of all steps were not kept."""
         if self.all_states is None:
             return None
         times, states = zip(*self.all_states, strict=True)
@@ -318,6 +323,7 @@ class Run:
             self.last_checkpoint_time = time.perf_counter()
 
     def _deferred_provenance(self, x0: np.ndarray) -> Any:
+        """Return the provenance of the run as a deferred value."""
         noise, schedule = self.problem.noise, self.schedule
         return defer(
             functools.partial(

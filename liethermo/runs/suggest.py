@@ -108,7 +108,7 @@ class MethodSuggestion:
 
 
 CANDIDATE_METHODS = (*map(MetriplecticRungeKutta, (4, 6, 8)), *map(MetriplecticGauss, (1, 2, 3, 4)))
-"""Methods that :func:`suggest_method` tries, beside a Taylor method of an order that depends on the tolerance."""
+"""Methods that :func:`suggest_method` tries, besides a Taylor method of an order that depends on the tolerance."""
 
 
 @with_library_settings
@@ -175,6 +175,7 @@ def _try_method(system: System, x0, rtol: float, method: OneStepMethod, t0: floa
     iterations = [0]
 
     def record_step_size_and_iterations(accepted_steps: AcceptedSteps):
+        """Record the size of an accepted step and the iterations so far; end the trial after thirty steps."""
         step_sizes.append(float(accepted_steps.h[0]))
         iterations.append(
             int(accepted_steps.state_after.fixed_point_iterations) + int(accepted_steps.state_after.newton_iterations)

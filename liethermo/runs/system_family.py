@@ -90,6 +90,7 @@ class Family:
 
     @classmethod
     def _from_named_parameters(cls, system: System, parameters) -> Family:
+        """Return the family of a system with values of named parameters for each member; None means one member."""
         if parameters is None:
             return cls(
                 ProgramStructure.from_module(system), [array[None] for array in parameter_arrays(system)], system
@@ -222,6 +223,7 @@ class Family:
         return list(zip(self.parameter_arrays, self.has_member_axis, strict=True))
 
     def member(self, member_index: int) -> System:
+        """Return one member as a system."""
         return (
             self.program_structure.rebuild(self.member_arrays(member_index))
             if self.common_system is None
@@ -356,8 +358,8 @@ def broadcast_size(*sizes: int) -> int:
     distinct_sizes = {size for size in sizes if size != 1}
     if len(distinct_sizes) > 1:
         raise InputError(
-            f"initial states, attitudes and parameters are for {' and '.join(map(str, sorted(distinct_sizes)))} "
-            "trajectories. Give one of each for all trajectories, or equal numbers"
+            "initial states, attitudes and parameters are for different numbers of trajectories, "
+            f"{sorted(distinct_sizes)}. Give equal numbers, or one for all trajectories"
         )
     if 0 in distinct_sizes:
         raise InputError("an ensemble needs at least one trajectory, got 0 initial states or sets of parameters")

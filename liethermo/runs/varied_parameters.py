@@ -132,6 +132,7 @@ class VariedParameters:
             return False
 
         def has_same_program(entries) -> bool:
+            """Return whether the system with these entries is prepared as the problem is, for the same program."""
             system = replace_fields(self._system_with_entries(entries), invariant_verdicts=verdicts)
             prepared_system, method = prepare_system_and_method(system, self._method)
             method.check(prepared_system)

@@ -102,6 +102,7 @@ def _allowed_entropy_fall(audit: Audit) -> float:
 
 
 def _draw_entropy_production(ax: Axes, t: np.ndarray, S: np.ndarray, rounding_threshold: float) -> None:
+    """Draw dS/dt on a logarithmic axis; increments below ``rounding_threshold`` are grey, larger decreases red."""
     dt, dS, t = np.diff(t), np.diff(S), (t[:-1] + t[1:]) / 2
     rounding_threshold = rounding_threshold or 4 * EPS * float(np.abs(S).max())
     is_rising, is_falling = dS > rounding_threshold, dS < -rounding_threshold

@@ -90,6 +90,7 @@ def study(
 
 
 def _checked_or_first_measure_name(dataset: xarray.Dataset, axes: list[str], variable: str | None) -> str:
+    """Return ``variable``, or by default the first measure with one number for each point."""
     measures = [str(name) for name in dataset.data_vars if name not in NON_MEASURE_VARIABLES]
     if variable is not None:
         if variable not in measures:
@@ -113,6 +114,7 @@ def _label_with_unit(values: xarray.DataArray) -> str:
 
 
 def _has_geometric_spacing(points: np.ndarray) -> bool:
+    """Return whether sorted positive points have nearly equal ratios, and unequal differences."""
     if len(points) < 3 or not (points > 0.0).all() or points.max() < 4.0 * points.min():
         return False
     gap_variations = [np.ptp(np.diff(p)) / np.abs(np.diff(p)).max() for p in (points, np.log(points))]
@@ -135,6 +137,7 @@ def _numeric_axis_values(coordinate: xarray.DataArray) -> np.ndarray:
 
 
 def _set_axis_scale_and_label(ax: Axes, axis_letter: str, coordinate: xarray.DataArray, points: np.ndarray) -> None:
+    """Set the scale, the ticks of texts and the label of the axis with this letter, x or y."""
     axis = getattr(ax, f"{axis_letter}axis")
     if _has_geometric_spacing(np.sort(points)):
         getattr(ax, f"set_{axis_letter}scale")("log")
@@ -153,6 +156,7 @@ def _colour_options(values: np.ndarray) -> dict[str, Any]:
 
 
 def _draw_heat_map(ax: Axes, values: xarray.DataArray, failure_mask: xarray.DataArray, n_contours: int) -> None:
+    """Draw a measure over two axes as a heat map with contours; failed points are hatched."""
     y_coordinate, x_coordinate = (values[dim] for dim in values.dims)
     y, x = _numeric_axis_values(y_coordinate), _numeric_axis_values(x_coordinate)
     rows, columns = np.argsort(y), np.argsort(x)
@@ -197,6 +201,7 @@ def _add_failure_legend(ax: Axes) -> None:
 def _draw_lines(
     ax: Axes, values: xarray.DataArray, failure_mask: xarray.DataArray, coordinate: xarray.DataArray
 ) -> None:
+    """Draw a measure over one axis, one line for each component; failed points are hatched."""
     points = _numeric_axis_values(coordinate)
     order = np.argsort(points)
     z, is_failed = values.to_numpy().reshape(len(points), -1)[order], failure_mask.to_numpy()[order]
@@ -222,6 +227,7 @@ def _draw_lines(
 def _draw_scatter_plot(
     ax: Axes, values: xarray.DataArray, failure_mask: xarray.DataArray, x: xarray.DataArray, y: xarray.DataArray
 ) -> None:
+    """Draw a measure of a sample as coloured points over two parameters; failed points are crosses."""
     z, is_failed = values.to_numpy(), failure_mask.to_numpy()
     colours = _colour_options(z[~is_failed])
     is_drawn = ~is_failed & np.isfinite(z)

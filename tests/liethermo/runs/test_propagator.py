@@ -215,6 +215,12 @@ def test_a_step_that_fails_raises_what_integrate_raises():
     assert str(error.value.solution.status) == str(expected_values.value.solution.status)
 
 
+def final_states_with(*rates):
+    """Return final states with values of the rate of dissipation, one after another."""
+    propagator = lt.Propagator(rigid_body(), None, 0.1)
+    return [propagator.final(MU, SPAN, parameters={"dissipation.rate": rate}) for rate in rates]
+
+
 test_bad_arguments = refusal_test(
     (lambda: lt.Propagator(rigid_body(), "RK4", 0.1), "method must be an integrator"),
     (lambda: lt.Propagator("body", None, 0.1), "the first argument must be a system"),
@@ -226,6 +232,11 @@ test_bad_arguments = refusal_test(
     (lambda: lt.Propagator(rigid_body(), None, 0.1).final(MU[:2], SPAN), "a state of this system must have shape"),
     (lambda: lt.Propagator(rigid_body(), None, 0.1).final(MU * np.nan, SPAN), "the state is not finite"),
     (lambda: lt.Propagator(rigid_body(), lt.Reference(), 0.1).many(MU, SPAN), "runs single trajectories"),
+    (lambda: lt.Propagator(rigid_body(), None, 0.1).final(MU, SPAN, parameters=0.3), "must be a dict from names"),
+    (lambda: lt.Propagator(rigid_body(), None, 0.1)(MU, SPAN, parameters=[0.3]), "must be a dict from names"),
+    (lambda: final_states_with(0.3, "0.3"), r"dissipation.rate must be made of real numbers, got '0.3'"),
+    (lambda: final_states_with("a"), r"dissipation.rate must be made of real numbers, got 'a'"),
+    (lambda: lt.Propagator(rigid_body(), None, 0.1)(MU, SPAN, save_at="a"), "save_at must be made of real numbers"),
 )
 
 
