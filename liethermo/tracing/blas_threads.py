@@ -44,8 +44,8 @@ def uses_one_blas_thread(jaxpr: Jaxpr) -> bool:
 def with_one_blas_thread(program: Callable) -> Callable:
     """Return a function that calls a compiled program while BLAS has one thread, and waits for its results.
 
-    Of several Python threads, the first one that sets a limit is the only one that may, as long as it lives: so a limit
-    that ends in another thread leaves the number of BLAS threads as it was.
+    The first Python thread that sets a limit is the only one that may, as long as it lives. In another thread a limit
+    has no effect, and programs may use more BLAS threads.
     """
 
     @functools.wraps(program)
