@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var, jaxpr_as_fun
 
+from ._index_check import check_indices
+
 
 def content_key(obj: Any) -> Hashable:
     """Return a hashable key of an object, such as a traced program, that is equal for equal operations and numbers.
@@ -127,6 +129,11 @@ class FrozenFunction:
     Attributes
     ----------
     closed_jaxpr : ClosedJaxpr
+
+    Raises
+    ------
+    IndexOutOfRangeError
+        If the function has a constant index that is out of range.
     """
 
     def __init__(self, function: Callable, shape: tuple[int, ...]):
@@ -134,6 +141,7 @@ class FrozenFunction:
         x = jax.ShapeDtypeStruct(shape, jnp.float64)
         # a new lambda, since JAX caches the trace of a function
         self.closed_jaxpr: ClosedJaxpr = jax.make_jaxpr(lambda x: jnp.asarray(function(x)))(x)
+        check_indices(self.closed_jaxpr)
         self._key = content_key(self.closed_jaxpr)
 
     def __call__(self, x):

@@ -56,6 +56,39 @@ class SpaceError(ManifoldsError, TypeError):
     """Raised when a state space lacks an operation, or an object cannot be a state space."""
 
 
+class IndexOutOfRangeError(ManifoldsError, IndexError):
+    """A function with a constant index that is out of range for its array.
+
+    Attributes
+    ----------
+    index, size : int
+        The index, and how many entries the axis has.
+    where : str
+        The line of the user's code, as far as JAX knows.
+    access : str
+        What JAX would do: "read" or "write" another entry, "fill" the result with NaN, or "drop" what is to be written.
+    """
+
+    def __init__(self, index: int, size: int, where: str, function: str = "a function", *, access: str = "read"):
+        self.index, self.size, self.where, self.access = index, size, where, access
+        python_rule = f"counts from 0, so the last index is {size - 1}" if size else "finds no entry in it"
+        noun = "entry" if size == 1 else "entries"
+        jax_rule, advice = {
+            "read": ("take another entry", f'x.at[{index}].get(mode="clip")'),
+            "write": ("change another entry", 'mode="clip" in x.at[...].set(...), add or another method'),
+            "fill": ("read NaN", 'mode="fill"'),
+            "drop": ("change no entry", 'mode="drop" in x.at[...].set(...), add or another method'),
+        }[access]
+        super().__init__(
+            f"{function} has the index {index} of an axis with {size} {noun}, which is out of range ({where}). "
+            f"Python {python_rule}. JAX would {jax_rule} without a word; where that is meant, write {advice}"
+        )
+
+    def with_function(self, function: str) -> IndexOutOfRangeError:
+        """Return the same error, saying which function has the index."""
+        return type(self)(self.index, self.size, self.where, function, access=self.access)
+
+
 class LieAlgebraError(ManifoldsError, ValueError):
     """Raised when data do not define a Lie algebra, or the algebra lacks an operation.
 

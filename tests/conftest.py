@@ -14,6 +14,7 @@ from pathlib import Path
 import hypothesis
 import jax
 import pytest
+import threadpoolctl
 
 FAST_COMPILE_FLAGS = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 """Flags that make XLA compile faster and optimise less. Most programs of the default tier run once and take longer to
@@ -27,6 +28,10 @@ hypothesis.settings.register_profile(
     "liethermo-slow", derandomize=False, deadline=None, database=None, print_blob=True, max_examples=10
 )
 
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of processes that a test starts
+threadpoolctl.threadpool_limits(limits=1, user_api="blas")
+# The workers of a run share the cores, and threads of BLAS wait in busy loops.
 
 gc.set_threshold(200_000, 20, 100)
 """Tracing makes many small objects that live: looking through them ever again costs a tenth of the time."""

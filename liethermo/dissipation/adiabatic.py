@@ -114,7 +114,7 @@ class AdiabaticJumps(ThermalJumps):
         if is_traced(body_energy):
             groups = _distinct_level_pair_groups(structure.size)
         else:
-            hamiltonians = system.hamiltonians()
+            hamiltonians = system.hamiltonians_at_test_times()
             groups = _group_numbers_of_level_pairs(hamiltonians)
             self._check_rates_at_zero(hamiltonians)
         return replace_fields(self, pair_groups=Indices(groups))
@@ -130,7 +130,7 @@ class AdiabaticJumps(ThermalJumps):
             if not (diagonals > ENERGY_RTOL * len(V) * np.abs(V).max()).any():
                 continue
             with jax.ensure_compile_time_eval():
-                value = float(self._rate_at(i, jnp.zeros(()), jnp.ones(()), jnp.zeros(())))
+                value = float(self._rates_at(i, jnp.zeros(1), jnp.ones(()), jnp.zeros(()))[0])
             if not np.isfinite(value):
                 raise InputError(
                     f"the rate of V[{i}] at omega = 0 is {value}, and V[{i}] has a component of this frequency. Give a "
@@ -186,7 +186,7 @@ class AdiabaticJumps(ThermalJumps):
                 is_zero = jnp.max(jnp.abs(components), axis=(-2, -1)) <= rounding
                 weights = np.where((np.arange(len(masks)) == 0) & is_self_adjoint, 0.5, 1.0)[group_slice]
                 used_omega = jnp.where(is_zero, 1.0, omega[group_slice])
-                component_rates = jnp.stack([self._rate_at(i, w, T, system.time) for w in used_omega])
+                component_rates = self._rates_at(i, used_omega, T, system.time)
                 operators.append(jnp.where(is_zero[:, None, None], 0.0, components))
                 frequencies.append(omega[group_slice])
                 rates.append(weights * component_rates)

@@ -344,18 +344,18 @@ class LiftedGeometry(NamedTuple):
         The inner system, in which the dissipation acts.
     x : array, shape (m,)
         The inner state.
-    lift : function
+    lift_covector : function
         Maps an outer gradient, shape (n,), to an inner one, shape (m,).
-    lower : function
-        Maps an inner velocity to an outer one.
+    lower_velocity : function
+        Maps an inner velocity, shape (m,), to an outer one, shape (n,).
     preserves_solenoidal : bool
         True if an inner field of divergence zero is lowered to one.
     """
 
     system: Geometry
     x: jax.Array
-    lift: Callable
-    lower: Callable
+    lift_covector: Callable
+    lower_velocity: Callable
     preserves_solenoidal: bool = False
 
     @classmethod
@@ -366,7 +366,11 @@ class LiftedGeometry(NamedTuple):
 
     def inner_gradients(self, dH, dS, dL) -> tuple:
         """Return the gradients of energy, entropy and preserved functions in the inner system; dS may be None."""
-        return self.lift(dH), None if dS is None else self.lift(dS), tuple(map(self.lift, dL))
+        return (
+            self.lift_covector(dH),
+            None if dS is None else self.lift_covector(dS),
+            tuple(map(self.lift_covector, dL)),
+        )
 
 
 class LiftedDissipation(Dissipation):
@@ -393,21 +397,28 @@ class LiftedDissipation(Dissipation):
 
     def force(self, system, x, dH, dS, dL):
         geometry = self.lifted_geometry(system, x)
-        return geometry.lower(self.inner.force(geometry.system, geometry.x, *geometry.inner_gradients(dH, dS, dL)))
+        return geometry.lower_velocity(
+            self.inner.force(geometry.system, geometry.x, *geometry.inner_gradients(dH, dS, dL))
+        )
 
     has_generator = forward_to("inner")
 
     def generator_field(self, system, x, dH):
         geometry = self.lifted_geometry(system, x)
-        return geometry.lower(self.inner.generator_field(geometry.system, geometry.x, geometry.lift(dH)))
+        return geometry.lower_velocity(
+            self.inner.generator_field(geometry.system, geometry.x, geometry.lift_covector(dH))
+        )
 
     def factor(self, system, x, dH, dL):
         geometry = self.lifted_geometry(system, x)
-        B = self.inner.factor(geometry.system, geometry.x, geometry.lift(dH), tuple(map(geometry.lift, dL)))
+        B = self.inner.factor(
+            geometry.system, geometry.x, geometry.lift_covector(dH), tuple(map(geometry.lift_covector, dL))
+        )
         if B is None:
             return None
         return B._replace(
-            times=lambda w: geometry.lower(B.times(w)), solenoidal=geometry.preserves_solenoidal and B.solenoidal
+            times=lambda w: geometry.lower_velocity(B.times(w)),
+            solenoidal=geometry.preserves_solenoidal and B.solenoidal,
         )
 
     def input_residuals(self, system, x):

@@ -21,6 +21,7 @@ from manifolds.algebras._subspaces import row_echelon
 from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 from manifolds.structures.poisson import StateIndices
 
+from ..functions.conditions import nonnegative_condition, semidefinite_condition
 from ..functions.edges import Edges
 from ..functions.indices import Indices, clique_pattern, pattern_of_matrix
 from .base import Dissipation, LawName, SkewFriction
@@ -50,7 +51,7 @@ class HeatConduction(Dissipation):
 
     first_bodies: Indices = eqx.field(static=True)
     second_bodies: Indices = eqx.field(static=True)
-    conductance: jax.Array
+    conductance: jax.Array = eqx.field(metadata=nonnegative_condition("a conductance").metadata)
     laws: tuple[Callable, ...]
     fourier_factors: str = eqx.field(static=True)
 
@@ -126,7 +127,7 @@ class LinearFriction(Dissipation):
         The body with these m momenta; by default R is diagonal with an entry for every momentum of the whole system.
     """
 
-    R: jax.Array | Callable
+    R: jax.Array | Callable = eqx.field(metadata=semidefinite_condition("friction", symmetric=False).metadata)
     body_index: int | None = eqx.field(static=True, default=None)
 
     def force(self, system, x, dH, dS, dL):
@@ -174,7 +175,7 @@ class Drag(Dissipation):
 
     first_bodies: Indices = eqx.field(static=True)
     second_bodies: Indices = eqx.field(static=True)
-    coefficient: jax.Array
+    coefficient: jax.Array = eqx.field(metadata=nonnegative_condition("a drag").metadata)
 
     def __init__(self, graph: Edges):
         self.first_bodies, self.second_bodies = Indices(graph.first), Indices(graph.second)
@@ -301,7 +302,7 @@ class Process(Module):
     heat_shares: tuple[float, ...] = eqx.field(static=True)
     entropy_transport: tuple[float, ...] = eqx.field(static=True)
     entropy: jax.Array
-    coefficient: jax.Array | Callable
+    coefficient: jax.Array | Callable = eqx.field(metadata=nonnegative_condition("a coefficient").metadata)
 
 
 class MatterExchange(Dissipation):

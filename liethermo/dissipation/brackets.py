@@ -18,9 +18,10 @@ from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
 from ..errors import IndefiniteError, InputError
 from ..functions.checks import traced_function_and_shape
-from ..functions.conditions import checked_numbers, require_condition
+from ..functions.conditions import checked_numbers, require_condition, semidefinite_condition
 from .base import Damping, Dissipation
 from .checks import (
+    RATE_CONDITION,
     check_form_shape,
     checked_bath_indices,
     checked_rate,
@@ -63,8 +64,8 @@ class DoubleBracket(Damping):
     (True, True)
     """
 
-    rate: jax.Array
-    metric: Any
+    rate: jax.Array = eqx.field(metadata=RATE_CONDITION.metadata)
+    metric: Any = eqx.field(metadata=semidefinite_condition("the metric").metadata)
 
     def __init__(self, rate=1.0, metric=None, bath=None):
         self.rate = checked_rate(rate)
@@ -158,7 +159,7 @@ class InnerProductDissipation(BracketDissipation):
     True
     """
 
-    K: Any
+    K: Any = eqx.field(metadata=semidefinite_condition("the inner product 𝒦").metadata)
 
     def __init__(self, K):
         if callable(K):
@@ -210,7 +211,7 @@ class KillingDissipation(BracketDissipation):
     True
     """
 
-    rate: jax.Array
+    rate: jax.Array = eqx.field(metadata=RATE_CONDITION.metadata)
     form: Any
 
     def __init__(self, rate=1.0, form=None):
@@ -341,8 +342,8 @@ class FourBracket(Dissipation):
 class KulkarniNomizu(Dissipation):
     """The 4-bracket of two forms; see :meth:`FourBracket.kulkarni_nomizu`."""
 
-    sigma: Callable | jax.Array
-    mu: Callable | jax.Array
+    sigma: Callable | jax.Array = eqx.field(metadata=semidefinite_condition("the form sigma").metadata)
+    mu: Callable | jax.Array = eqx.field(metadata=semidefinite_condition("the form mu").metadata)
 
     def __init__(self, sigma, mu):
         self.sigma = sigma if callable(sigma) else checked_semidefinite(sigma, "the form sigma")

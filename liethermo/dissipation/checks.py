@@ -11,12 +11,15 @@ from manifolds.matrices.linear import BlockDiagonal, Diagonal
 
 from ..errors import IndefiniteError, InputError
 from ..functions.checks import traced_function_and_shape
-from ..functions.conditions import checked_numbers, require_condition
+from ..functions.conditions import Condition, checked_numbers, require_condition
 from ..functions.indices import Indices
 from .geometry import Geometry
 
 NEGATIVE_RATE_MESSAGE = "a dissipation rate must be >= 0, got {value}: a negative rate would lower the entropy"
 """Message for a rate that is negative or NaN."""
+
+RATE_CONDITION = Condition(lambda rate: rate >= 0.0, NEGATIVE_RATE_MESSAGE)
+"""Condition on the rate, or the rates, of a dissipation."""
 
 NEGATIVE_EIGENVALUE_MESSAGE = (
     "has the negative eigenvalue {value:.3g}: it must be positive semidefinite, or entropy would fall"
@@ -44,7 +47,7 @@ def state_shape_dtype(dim: int):
 def checked_rate(rate) -> jax.Array:
     """Return a rate as one nonnegative number (or a traced one)."""
     array = checked_numbers(rate, "a rate", ())
-    require_condition(array, lambda rate: rate >= 0.0, NEGATIVE_RATE_MESSAGE)
+    RATE_CONDITION.require(array)
     return array
 
 

@@ -17,8 +17,10 @@ from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
 from ..errors import InputError
 from ..functions.checks import traced_function_and_shape
+from ..functions.conditions import semidefinite_condition
 from .base import Damping, Dissipation
 from .checks import (
+    RATE_CONDITION,
     check_form_shape,
     checked_bath_indices,
     checked_rate,
@@ -63,8 +65,8 @@ class Friction(Damping):
     (True, True)
     """
 
-    D: Callable | jax.Array | None
-    rate: jax.Array
+    D: Callable | jax.Array | None = eqx.field(metadata=semidefinite_condition("the friction D").metadata)
+    rate: jax.Array = eqx.field(metadata=RATE_CONDITION.metadata)
 
     def __init__(self, D=None, rate=1.0, bath=None):
         reject_rate_as_form(D, self, "the friction D")
@@ -146,8 +148,8 @@ class FrictionOperator(Dissipation):
     True
     """
 
-    K: Callable | jax.Array
-    rate: jax.Array
+    K: Callable | jax.Array = eqx.field(metadata=semidefinite_condition("the friction operator K").metadata)
+    rate: jax.Array = eqx.field(metadata=RATE_CONDITION.metadata)
     project: bool = eqx.field(static=True)
     projection: str = eqx.field(static=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -19,7 +20,7 @@ from ..errors import InputError
 from ..functions.conditions import checked_numbers
 from ..functions.frames import sqrt_or_zero
 from .base import Damping
-from .checks import checked_bath_indices, checked_rate, checked_rates
+from .checks import RATE_CONDITION, checked_bath_indices, checked_rate, checked_rates
 from .factor import Factor
 
 
@@ -57,7 +58,7 @@ class LandauLifshitz(Damping):
     (True, True)
     """
 
-    rate: jax.Array
+    rate: jax.Array = eqx.field(metadata=RATE_CONDITION.metadata)
 
     def __init__(self, rate=1.0, bath=None):
         array = checked_numbers(rate, "a rate")

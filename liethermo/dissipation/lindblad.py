@@ -15,7 +15,7 @@ from manifolds.matrices.linear import adjoint
 
 from ..errors import InputError
 from .base import Dissipation
-from .checks import checked_rate
+from .checks import RATE_CONDITION, checked_rate
 from .operators import HasMatrix, Operator, checked_hermitian, checked_square_matrix, get_density_structure
 
 
@@ -56,7 +56,7 @@ class LindbladJumps(Dissipation):
     """
 
     operators: tuple[Operator | OperatorFunction, ...]
-    rates: tuple[Any, ...]
+    rates: tuple[Any, ...] = eqx.field(metadata=RATE_CONDITION.metadata)
 
     energy_law = None
     entropy_law = None

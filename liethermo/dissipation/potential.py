@@ -13,11 +13,11 @@ from manifolds._pytree_module import Module, forward_to
 from manifolds.matrices.exponential import hyperbolic_stumpff
 
 from ..errors import FunctionError, InputError
-from ..functions.conditions import checked_numbers
+from ..functions.conditions import checked_numbers, positive_condition
 from ..functions.time_span import required_argument_count
 from ..tracing.index_check import checked_result_shapes
 from .base import Dissipation
-from .checks import state_shape_dtype
+from .checks import RATE_CONDITION, state_shape_dtype
 from .factor import Factor
 from .projected_metric import ProjectedMetric
 
@@ -235,8 +235,8 @@ class ActivatedFriction(NamedPotential):
         Apply the potential to every force by itself, or to their length (by default).
     """
 
-    rate: jax.Array
-    scale: jax.Array
+    rate: jax.Array = eqx.field(metadata=RATE_CONDITION.metadata)
+    scale: jax.Array = eqx.field(metadata=positive_condition("the scale").metadata)
 
     def __init__(self, rate=1.0, scale=1.0, *, each: bool = False):
         self.rate, self.scale = (

@@ -15,10 +15,18 @@ from manifolds.matrices.symmetric import semidefinite_factor, semidefinite_root
 
 from ..errors import InputError
 from ..functions.checks import with_polynomial_degrees
+from ..functions.conditions import semidefinite_condition
 from ..functions.energy import Energy, make_energy
 from ..functions.frames import gram_schmidt, sqrt_or_zero
 from .base import Dissipation
-from .checks import checked_rate, checked_rates, checked_semidefinite, evaluate_form, reject_rate_as_form
+from .checks import (
+    RATE_CONDITION,
+    checked_rate,
+    checked_rates,
+    checked_semidefinite,
+    evaluate_form,
+    reject_rate_as_form,
+)
 from .factor import Factor
 from .geometry import isotropic_size, isotropic_vector, project_tangent
 
@@ -62,10 +70,10 @@ class ProjectedMetric(Dissipation):
     True
     """
 
-    cometric: jax.Array | Callable | None
+    cometric: jax.Array | Callable | None = eqx.field(metadata=semidefinite_condition("the cometric").metadata)
     functions: tuple[Energy, ...]
     normalized: bool = eqx.field(static=True)
-    rate: jax.Array
+    rate: jax.Array = eqx.field(metadata=RATE_CONDITION.metadata)
 
     def __init__(self, cometric=None, preserve=(), normalized=False, rate=1.0):
         reject_rate_as_form(cometric, self, "the cometric")
@@ -164,8 +172,8 @@ class LocalProjectedMetric(Dissipation):
         G of one site, positive definite; the identity by default.
     """
 
-    rate: jax.Array
-    cometric: jax.Array | None
+    rate: jax.Array = eqx.field(metadata=RATE_CONDITION.metadata)
+    cometric: jax.Array | None = eqx.field(metadata=semidefinite_condition("the cometric of a site").metadata)
 
     def __init__(self, rate=1.0, cometric=None):
         self.rate = checked_rates(rate)

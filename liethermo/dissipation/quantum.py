@@ -24,7 +24,7 @@ from ..functions.density import matrix_logarithm
 from ..functions.gradients import EPS
 from ..functions.time_span import required_argument_count
 from .base import Dissipation
-from .checks import checked_rate
+from .checks import RATE_CONDITION, checked_rate
 from .operators import (
     ENERGY_RTOL,
     Operator,
@@ -103,7 +103,7 @@ class ThermalJumps(Dissipation):
     """
 
     operators: tuple[Operator, ...] = eqx.field(static=True)
-    rates: tuple[Any, ...]
+    rates: tuple[Any, ...] = eqx.field(metadata=RATE_CONDITION.metadata)
     bath: int = eqx.field(static=True)
     jumps: tuple[Jump, ...] = eqx.field(static=True, repr=False)
     jump_frame: Operator | None = eqx.field(static=True, repr=False)
@@ -148,7 +148,7 @@ class ThermalJumps(Dissipation):
                 "ThermalJumps need the eigenvectors of the Hamiltonian, so it must not be a traced value. Build a "
                 "system for each Hamiltonian, as lt.Study does. Rates, temperatures and capacities may be traced"
             )
-        hamiltonians = system.hamiltonians()
+        hamiltonians = system.hamiltonians_at_test_times()
         if not baths.number:
             jumps = tuple(Jump(V, i, 0.5 if is_hermitian(V) else 1.0) for i, V in enumerate(self.operators))
             conserves_energy = all(is_commuting(H, V) for H in hamiltonians for V in map(np.asarray, self.operators))
@@ -337,21 +337,28 @@ class ThermalJumps(Dissipation):
     def _weighted_jump_rates(self, system, omega, T) -> jax.Array:
         """Return the rate of each jump at its transition frequency and the temperature of its bath, times its
         weight, shape (jumps,)."""
-        return jnp.stack(
-            [
-                jump.weight * self._rate_at(jump.coupling_index, omega[i], T, system.time)
-                for i, jump in enumerate(self.jumps)
-            ]
-        )
+        weights = np.array([jump.weight for jump in self.jumps])
+        jump_counts = np.bincount([jump.coupling_index for jump in self.jumps], minlength=len(self.rates))
+        omega_by_coupling = jnp.split(omega, np.cumsum(jump_counts)[:-1])  # the jumps are in the order of the couplings
+        rates = [
+            self._rates_at(i, coupling_omega, T, system.time)
+            for i, coupling_omega in enumerate(omega_by_coupling)
+            if jump_counts[i]
+        ]
+        return jnp.concatenate(rates) * weights
 
-    def _rate_at(self, i: int, omega, T, time) -> jax.Array:
-        """Return the rate of the coupling i at a frequency and a temperature, shape (); ``time`` may be None."""
+    def _rates_at(self, i: int, omega, T, time) -> jax.Array:
+        """Return the rates of the coupling i at frequencies, shape (k,), and a temperature; ``time`` may be None.
+
+        The rate function is traced once for all of them.
+        """
         rate = self.rates[i]
-        if i in self.timed_rates:
-            if time is None:
-                raise InputError(f"the rate of V[{i}] depends on time. Use system.at_time(t)")
-            return jnp.asarray(rate(omega, T, time))
-        return jnp.asarray(rate(omega, T) if callable(rate) else rate)
+        if i in self.timed_rates and time is None:
+            raise InputError(f"the rate of V[{i}] depends on time. Use system.at_time(t)")
+        arguments = (T, time) if i in self.timed_rates else (T,)
+        if not callable(rate):
+            return jnp.broadcast_to(rate, omega.shape)
+        return jax.vmap(lambda w: jnp.asarray(rate(w, *arguments)))(omega)
 
 
 GENERIC_WEIGHTS = (1.0, 0.7548776662466927, 0.5698402909980532)

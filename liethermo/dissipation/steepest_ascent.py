@@ -17,7 +17,7 @@ from ..functions.density import DensityMatrixFunction, positive_part
 from ..functions.energy import Energy, Function
 from ..functions.frames import OrthonormalFrame, gram_schmidt
 from .base import Dissipation
-from .checks import checked_rate
+from .checks import RATE_CONDITION, checked_rate
 from .operators import Operator, checked_hermitian, get_density_structure
 
 
@@ -48,7 +48,7 @@ class SteepestEntropyAscent(Dissipation):
     True
     """
 
-    rate: jax.Array
+    rate: jax.Array = eqx.field(metadata=RATE_CONDITION.metadata)
     functions: tuple[Any, ...]
 
     def __init__(self, rate=1.0, preserve=()):

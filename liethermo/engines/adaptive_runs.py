@@ -65,6 +65,7 @@ class ArrayAdaptiveRuns:
         return (value[None] if self._is_single else value)[indices]
 
     def write(self, field_name: str, indices: np.ndarray | slice, values) -> None:
+        """Set a field of ``State`` or ``AdaptiveState`` of the chosen trajectories to values, trajectories first."""
         values_of_all = self.read(field_name).copy()
         values_of_all[indices] = values
         changes = {field_name: jnp.asarray(values_of_all[0] if self._is_single else values_of_all)}
@@ -74,9 +75,10 @@ class ArrayAdaptiveRuns:
         )
 
     def advance(self, max_attempts: int) -> None:
-        """Make up to ``max_attempts`` attempts of each trajectory, fewer if it pauses."""
+        """Make up to ``max_attempts`` attempts of a step in each trajectory, fewer if it pauses."""
         self.adaptive_state = self.lazy_newton.advance_adaptive(
-            lambda adaptive_state, newton: self._advance(adaptive_state, max_attempts, newton), self.adaptive_state
+            lambda adaptive_state, with_newton: self._advance(adaptive_state, max_attempts, with_newton),
+            self.adaptive_state,
         )
 
     def state_of_only_trajectory(self) -> State:
@@ -84,7 +86,7 @@ class ArrayAdaptiveRuns:
         return State(*(self.read(name)[0] for name in State._fields))
 
     def record_attempts(self, max_attempts: int) -> dict[str, np.ndarray]:
-        """Make one attempt of the only trajectory and return its record, the fields ATTEMPT_FIELDS."""
+        """Make one attempt of a step of the only trajectory; return its record by the names in ATTEMPT_FIELDS."""
         del max_attempts  # a single attempt: this engine does not record several at once
         self.advance(1)
         return {name: self.read(name) for name in ATTEMPT_FIELDS}
@@ -102,22 +104,22 @@ def start_adaptive_run(
     t,
     stop_time,
     span_length,
-    step: Callable | None = None,
+    host_step: Callable | None = None,
 ) -> ArrayAdaptiveRuns:
-    """Start an adaptive run of one trajectory; ``step`` takes the steps of an engine that runs on the host."""
+    """Return the adaptive run of one trajectory from x; ``host_step`` takes the steps of an engine on the host."""
     adaptive_state = initial_adaptive_state_program(
         system, method, control, jnp.asarray(x), *map(jnp.asarray, map(float, (t, stop_time, span_length)))
     )
 
-    def advance_one(adaptive_state: AdaptiveState, max_attempts: int, newton: bool) -> AdaptiveState:
-        if step is not None:
-            return advance_adaptive_on_host(step, system, method, control, adaptive_state, max_attempts)
+    def advance_one(adaptive_state: AdaptiveState, max_attempts: int, with_newton: bool) -> AdaptiveState:
+        if host_step is not None:
+            return advance_adaptive_on_host(host_step, system, method, control, adaptive_state, max_attempts)
         return advance_adaptive(
-            system, method, control, adaptive_state, jnp.asarray(max_attempts), DEFAULT_OPTIONS, newton
+            system, method, control, adaptive_state, jnp.asarray(max_attempts), DEFAULT_OPTIONS, with_newton
         )
 
     run = ArrayAdaptiveRuns(method, adaptive_state, advance_one, True)
-    run.lazy_newton.has_newton |= step is not None  # a host engine has its own Newton's method
+    run.lazy_newton.has_newton |= host_step is not None  # a host engine has its own Newton's method
     return run
 
 
@@ -144,7 +146,7 @@ def start_adaptive_runs(
     stop_time,
     span_length,
 ) -> ArrayAdaptiveRuns:
-    """Start the adaptive runs of all trajectories of a batch, in one program."""
+    """Return the adaptive runs of all trajectories of a batch, shape (trajectories, n), in one program."""
     static_inputs = structure, parameters, axes, method, control
     adaptive_state = _start_batch_program(
         *static_inputs, jnp.asarray(x), *map(jnp.asarray, map(float, (t, stop_time, span_length)))
@@ -152,14 +154,16 @@ def start_adaptive_runs(
     return ArrayAdaptiveRuns(
         method,
         adaptive_state,
-        lambda pace, max_attempts, newton: _advance_batch_program(
-            *static_inputs, pace, jnp.asarray(max_attempts), newton
+        lambda adaptive_state, max_attempts, with_newton: _advance_batch_program(
+            *static_inputs, adaptive_state, jnp.asarray(max_attempts), with_newton
         ),
     )
 
 
 @jit_cached
 def _start_batch_program(structure, parameters, axes, method, control, x, t, stop_time, span_length):
+    """Return the initial adaptive states of a batch, with a leading axis of trajectories."""
+
     def start_member(p, x):
         return initial_adaptive_state(structure.rebuild(p), method, control, x, t, stop_time, span_length)
 
@@ -167,10 +171,14 @@ def _start_batch_program(structure, parameters, axes, method, control, x, t, sto
 
 
 @jit_cached
-def _advance_batch_program(structure, parameters, axes, method, control, adaptive_states, max_attempts, newton: bool):
+def _advance_batch_program(
+    structure, parameters, axes, method, control, adaptive_states, max_attempts, with_newton: bool
+):
+    """Return the adaptive states of a batch after up to ``max_attempts`` attempts of each trajectory."""
+
     def advance_member(p, adaptive_state):
         return advance_adaptive(
-            structure.rebuild(p), method, control, adaptive_state, max_attempts, DEFAULT_OPTIONS, newton
+            structure.rebuild(p), method, control, adaptive_state, max_attempts, DEFAULT_OPTIONS, with_newton
         )
 
     return jax.vmap(advance_member, in_axes=(axes, 0))(parameters, adaptive_states)
@@ -181,10 +189,10 @@ EVENT_ZERO_ULPS = 2.0**10
 
 
 def _event_rounding_scale(event_model: tuple[System, Any], time_and_state) -> jax.Array:
-    """Return the rounding error scale of an event function at (t, x), including the rounding of x itself."""
+    """Return the scale of the rounding error of an event function at (t, x), including the rounding of x."""
     (system, event_function), t, x = event_model, time_and_state[0], time_and_state[1:]
     return propagated_rounding_scale(
-        lambda y: event_function(system, t, y), x, jnp.maximum(jnp.abs(x), system.component_scales(x))
+        lambda y: event_function(system, t, y), x, jnp.maximum(jnp.abs(x), system.slope_scales(x))
     )
 
 
@@ -193,9 +201,9 @@ DIFFERENCE_STEP = 1e-6
 
 
 def _event_rounding_scale_by_differences(event_model: tuple[System, Any], time_and_state: np.ndarray) -> float:
-    """Return the rounding error scale of an event function that cannot be traced, by that of x alone."""
+    """Return the scale of the rounding error of an untraceable event function, due to the rounding of x."""
     (system, event_function), t, x = event_model, time_and_state[0], time_and_state[1:]
-    scales, directions = np.maximum(np.abs(x), system.component_scales(x)), np.random.default_rng(0)
+    scales, directions = np.maximum(np.abs(x), system.slope_scales(x)), np.random.default_rng(0)
     derivatives = []
     for _ in range(4):
         h = DIFFERENCE_STEP * scales * directions.choice([-1.0, 1.0], len(x))
@@ -205,7 +213,7 @@ def _event_rounding_scale_by_differences(event_model: tuple[System, Any], time_a
 
 
 class EventRules(NamedTuple):
-    """Rules for the zeros of event functions.
+    """For each event function, how many zeros end the run, and whether jumps count as events.
 
     Attributes
     ----------
@@ -220,7 +228,7 @@ class EventRules(NamedTuple):
 
 
 class EventOccurrence(NamedTuple):
-    """Event of one trajectory: its index, the number of the event function, the time, and the state, shape (n,)."""
+    """An event of one trajectory, with the indices of trajectory and function, the time and the state, shape (n,)."""
 
     trajectory: int
     function: int
@@ -232,7 +240,7 @@ class EventOccurrence(NamedTuple):
 
 
 class PauseHandler:
-    """Host-side handling of the pauses of adaptive runs.
+    """Handler of the pauses of adaptive runs on the host: it records events, and ends or resumes trajectories.
 
     Parameters
     ----------
@@ -274,16 +282,16 @@ class PauseHandler:
         self.undefined_ends: list[tuple[int, float]] = []
         self._event_counts = np.zeros((len(adaptive_runs.read("t")), len(rules.counts_jumps)), dtype=int)
 
-    def keep_only(self, indices: np.ndarray) -> None:
-        """Drop all trajectories except the chosen ones, after the runs have dropped them."""
+    def keep_trajectories(self, indices: np.ndarray) -> None:
+        """Drop the counts of all trajectories except the chosen ones, after the runs have dropped them."""
         self._event_counts = self._event_counts[indices]
 
     def paused_indices(self, reason: int) -> np.ndarray:
-        """Return the indices of the trajectories that pause for ``reason``."""
+        """Return the indices of the trajectories that pause for a reason, a StatusCode."""
         return np.flatnonzero(self.adaptive_runs.read("status") == reason)
 
     def end_or_resume_at_sign_changes(self) -> None:
-        """End or resume each trajectory that is paused at a sign change of an event function.
+        """End or resume each trajectory that has paused at a sign change of an event function; record events.
 
         A zero, to rounding, is an event, and so is a jump or a pole if jumps count as events. The run ends at the last
         event that it waits for; otherwise it resumes. If a function is NaN between the two signs, it is unknown whether
@@ -296,21 +304,24 @@ class PauseHandler:
         values = runs.read("root_bracket", indices)[:, -values_before.shape[1] :]
         t, status = runs.read("t", indices), np.full(len(indices), StatusCode.COMPLETED)
         has_changed = self._has_changed_sign(values_before, values)
-        for k, counts_jumps in enumerate(self.rules.counts_jumps):
-            rows = np.flatnonzero(has_changed[:, k])
-            is_known, before, after = np.isfinite(values_before[rows, k]), values_before[rows, k], values[rows, k]
-            is_zero = is_known & (counts_jumps | self._is_zero_to_rounding(indices[rows], k, after, before))
-            self.sign_jumps += [(k, time) for time in t[rows[is_known & ~is_zero]].tolist()]
+        for function_index, counts_jumps in enumerate(self.rules.counts_jumps):
+            rows = np.flatnonzero(has_changed[:, function_index])
+            old_values, new_values = values_before[rows, function_index], values[rows, function_index]
+            is_known = np.isfinite(old_values)
+            is_zero = is_known & (
+                counts_jumps | self._is_zero_to_rounding(indices[rows], function_index, new_values, old_values)
+            )
+            self.sign_jumps += [(function_index, time) for time in t[rows[is_known & ~is_zero]].tolist()]
             if counts_jumps:
-                self.undefined_ends += [(k, time) for time in t[rows[~is_known]].tolist()]
+                self.undefined_ends += [(function_index, time) for time in t[rows[~is_known]].tolist()]
             else:
                 status[rows[~is_known]] = StatusCode.NON_FINITE
             for row in rows[is_zero]:
                 trajectory = int(indices[row])
                 x = runs.read("x", indices[row : row + 1])[0]
-                self.occurrences.append(EventOccurrence(trajectory, k, float(t[row]), x))
-                self._event_counts[trajectory, k] += 1
-                if self._event_counts[trajectory, k] == self.rules.terminal_counts[k]:
+                self.occurrences.append(EventOccurrence(trajectory, function_index, float(t[row]), x))
+                self._event_counts[trajectory, function_index] += 1
+                if self._event_counts[trajectory, function_index] == self.rules.terminal_counts[function_index]:
                     status[row] = StatusCode.EVENT
         resumes = status == StatusCode.COMPLETED
         status[resumes & (t >= runs.read("stop_time", indices))] = StatusCode.PAUSED_AT_STOP
@@ -326,7 +337,7 @@ class PauseHandler:
             runs.write("steps_at_last_stop", indices[resumes], (runs.read("step", indices) - n_done)[resumes])
 
     def _has_changed_sign(self, values_before: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return whether each event function has changed its sign at a pause, shape (trajectories, functions).
+        """Return whether each event function has changed sign at a pause: bools, shape (trajectories, functions).
 
         At least one has: the one that is nearest to its zero may still have the sign before.
         """
@@ -337,8 +348,10 @@ class PauseHandler:
         ratios = np.where(can_change, ratios, np.inf)
         return can_change & ((ratios <= 0.0) | (ratios == ratios.min(axis=1, keepdims=True)))
 
-    def _is_zero_to_rounding(self, indices: np.ndarray, k: int, value: np.ndarray, value_before: np.ndarray):
-        """Return whether values of event function k are zero, to rounding, given those at the start of the steps.
+    def _is_zero_to_rounding(
+        self, indices: np.ndarray, function_index: int, value: np.ndarray, value_before: np.ndarray
+    ):
+        """Return whether values of an event function, shape (m,), are zero to rounding: bools, shape (m,).
 
         A value is zero if it is negligible relative to the value before. Otherwise it is compared with the rounding of
         the function, except near a pole, where the value has grown and its rounding is as large as the value.
@@ -348,20 +361,21 @@ class PauseHandler:
         for group in self._group_by_system(
             indices[~is_zero & np.isfinite(magnitude) & (magnitude <= EVENT_ZERO_ULPS * value_before)]
         ):
-            in_group, model = np.isin(indices, group), (self.system_of(int(group[0])), self.control.event_functions[k])
+            is_in_group = np.isin(indices, group)
+            model = self.system_of(int(group[0])), self.control.event_functions[function_index]
             times_and_states = np.column_stack([self.adaptive_runs.read(name, group) for name in ("t", "x")])
             rounding_scales = (
                 np.array([_event_rounding_scale_by_differences(model, row) for row in times_and_states])
                 if model[1].calls_python
                 else evaluate_at_points(_event_rounding_scale, model, times_and_states)
             )
-            is_zero[in_group] = magnitude[in_group] <= EVENT_ZERO_ULPS * EPS * np.where(
+            is_zero[is_in_group] = magnitude[is_in_group] <= EVENT_ZERO_ULPS * EPS * np.where(
                 np.isnan(rounding_scales), np.inf, rounding_scales
             )
         return is_zero
 
     def _group_by_system(self, indices: np.ndarray) -> list[np.ndarray]:
-        """Return the indices of trajectories, one array for each system."""
+        """Return the indices of trajectories grouped by system, a list with one array for each system."""
         groups: dict[int, list[int]] = {}
         systems = [self.system_of(int(i)) for i in indices]  # kept alive, so that no id is used twice
         for i, system in zip(indices, systems, strict=True):
@@ -369,29 +383,31 @@ class PauseHandler:
         return [np.array(group) for group in groups.values()]
 
     def resume_paused(self) -> None:
-        """Resume trajectories that paused, finish those that have reached their end, and compute missing growth
-        rates."""
+        """Resume paused trajectories, finish those at their end, and compute the growth rates that they lack."""
         runs, status = self.adaptive_runs, self.adaptive_runs.read("status")
-        at_stop = np.flatnonzero(status == StatusCode.PAUSED_AT_STOP)
-        if at_stop.size:
-            t = runs.read("t", at_stop)
+        stopped_indices = np.flatnonzero(status == StatusCode.PAUSED_AT_STOP)
+        if stopped_indices.size:
+            t = runs.read("t", stopped_indices)
             is_done = t >= self.stop_times[-1]
-            runs.write("status", at_stop[is_done], StatusCode.REACHED_END)
-            at_stop, t = at_stop[~is_done], t[~is_done]
-        if at_stop.size:
-            runs.write("last_stop_time", at_stop, t)
-            runs.write("steps_at_last_stop", at_stop, runs.read("step", at_stop))
-            runs.write("stop_time", at_stop, self.stop_times[np.searchsorted(self.stop_times, t, side="right")])
-        waiting = np.concatenate([at_stop, np.flatnonzero(status == StatusCode.PAUSED_FOR_GROWTH_RATE)])
-        if not waiting.size:
+            runs.write("status", stopped_indices[is_done], StatusCode.REACHED_END)
+            stopped_indices, t = stopped_indices[~is_done], t[~is_done]
+        if stopped_indices.size:
+            runs.write("last_stop_time", stopped_indices, t)
+            runs.write("steps_at_last_stop", stopped_indices, runs.read("step", stopped_indices))
+            runs.write("stop_time", stopped_indices, self.stop_times[np.searchsorted(self.stop_times, t, side="right")])
+        resumable_indices = np.concatenate(
+            [stopped_indices, np.flatnonzero(status == StatusCode.PAUSED_FOR_GROWTH_RATE)]
+        )
+        if not resumable_indices.size:
             return
-        without_rate = waiting[np.isnan(runs.read("growth_rate", waiting))]
-        if without_rate.size:
-            self._update_growth_rates_and_step_sizes(without_rate)
-        is_exhausted = runs.read("n_attempts", waiting) >= float(self.control.max_attempts)
-        runs.write("status", waiting, np.where(is_exhausted, StatusCode.STEP_LIMIT, StatusCode.COMPLETED))
+        indices_lacking_rate = resumable_indices[np.isnan(runs.read("growth_rate", resumable_indices))]
+        if indices_lacking_rate.size:
+            self._update_growth_rates_and_step_sizes(indices_lacking_rate)
+        is_exhausted = runs.read("n_attempts", resumable_indices) >= float(self.control.max_attempts)
+        runs.write("status", resumable_indices, np.where(is_exhausted, StatusCode.STEP_LIMIT, StatusCode.COMPLETED))
 
     def _update_growth_rates_and_step_sizes(self, indices: np.ndarray) -> None:
+        """Compute the growth rates of trajectories, and limit their next steps by them."""
         probes, runs = self.adaptive_runs.read("jacobian_probe", indices), self.adaptive_runs
         if probes.shape[2] <= DENSE_JACOBIAN_DIM:
             rates = max_growth_rates(probes)

@@ -19,7 +19,7 @@ import numpy as np
 from ..integrators import OneStepMethod
 from ..integrators.base import event_check_fractions
 from ..systems import System
-from ..systems.clock import system_of_step
+from ..systems.clock import system_between_breaks
 from ..tracing.programs import jit_cached
 from . import root_bracket
 from .solver_options import DEFAULT_OPTIONS, EPS, SolverOptions
@@ -32,10 +32,10 @@ from .step_control import (
     TRUNCATED_STEP_RATIO,
     AdaptiveState,
     StepControl,
-    jacobian_probe,
     limit_next_step_by_growth_rate,
     max_step_for_attitude,
     next_step_size_and_end_time,
+    probe_jacobian,
     step_size_after_acceptance,
     step_size_after_rejection,
 )
@@ -47,7 +47,7 @@ ATTEMPT_FIELDS = ("x", "energy", "entropy", "step", "t", "last_step_size")
 def initial_adaptive_state(
     system: System, method: OneStepMethod, control: StepControl, x, t, stop_time, span_length
 ) -> AdaptiveState:
-    """Return the state of an adaptive run from x at time t to t + ``span_length``."""
+    """Return the adaptive state at the start of a run from x, at time t, with the first step size chosen."""
     state, zero = initial_run_state(system, method, x), jnp.zeros(())
     solved_system, components = system.solved_subsystem(x)
     norm = jnp.max(jnp.abs(components))
@@ -64,7 +64,7 @@ def initial_adaptive_state(
     first_step = jnp.minimum(jnp.where(control.first_step > 0.0, control.first_step, estimated_step), control.max_step)
     if control.adaptive:
         first_step = jnp.minimum(first_step, max_step_for_attitude(method, system, x, relative_tolerance))
-    probe = jacobian_probe(solved_system, components) if control.adaptive else jnp.zeros((1, 1))
+    probe = probe_jacobian(solved_system, components) if control.adaptive else jnp.zeros((1, 1))
     adaptive_state = AdaptiveState(
         state=state,
         t=zero + t,
@@ -94,7 +94,7 @@ def attempt_step(
     options: SolverOptions = DEFAULT_OPTIONS,
     newton_fallback=None,
 ) -> AdaptiveState:
-    """Return the adaptive state after one attempted step; ``newton_fallback`` as for :func:`.step.take_step`."""
+    """Return the adaptive state after an attempted step; ``newton_fallback`` as for :func:`.step.take_step`."""
     h, time_after = next_step_size_and_end_time(control, adaptive_state)
     return accept_or_reject(
         system,
@@ -116,7 +116,7 @@ def accept_or_reject(
     time_after,
     new_state: State,
 ) -> AdaptiveState:
-    """Return the adaptive state after an attempted step to ``new_state``: accept the step, or choose another size."""
+    """Return the adaptive state after an attempt that led to ``new_state``, with the next step size chosen."""
     old_state, is_solved = adaptive_state.state, new_state.status == StatusCode.COMPLETED
     attempt_status = 1.0 * new_state.status
     is_accepted, next_step_size, code = is_solved, adaptive_state.next_step_size, new_state.status
@@ -132,7 +132,9 @@ def accept_or_reject(
             control.allowed_error(norm) * jnp.minimum(time_fraction, 1.0),
             MIN_RELATIVE_ERROR * norm + DEFAULT_OPTIONS.tiny,
         )
-        error = method.error(system_of_step(system, old_state.x), old_state.x, old_state.compensation, h, new_state.k)
+        error = method.error(
+            system_between_breaks(system, old_state.x), old_state.x, old_state.compensation, h, new_state.k
+        )
         error = error / allowed_error
         error = jnp.where(is_solved, error, jnp.inf)
         is_accepted = error <= 1.0
@@ -196,7 +198,7 @@ def accept_or_reject(
     if not control.adaptive:
         return new_adaptive_state
     limited_state = limit_next_step_by_growth_rate(
-        method, new_adaptive_state, jacobian_probe(*system.solved_subsystem(new_state.x))
+        method, new_adaptive_state, probe_jacobian(*system.solved_subsystem(new_state.x))
     )
     new_adaptive_state = jax.tree_util.tree_map(select_if_running, limited_state, new_adaptive_state)
     is_exhausted = (n_attempts >= control.max_attempts) & (new_adaptive_state.state.status == StatusCode.COMPLETED)
@@ -207,7 +209,7 @@ def accept_or_reject(
 
 
 class AttemptOutcome(NamedTuple):
-    """Outcome of an attempted step."""
+    """The outcome of an attempted step: whether it is accepted, and what is tried next."""
 
     is_accepted: jax.Array  # whether the new state is accepted
     is_at_event: jax.Array  # whether the first sign change of an event function is at the time after
@@ -228,7 +230,7 @@ def apply_event_detection(
     new_state: State,
     outcome: AttemptOutcome,
 ) -> AttemptOutcome:
-    """Return the outcome of an attempt, corrected for sign changes of the event functions.
+    """Return the outcome of an attempt, changed if event functions change sign in the step.
 
     A step in which events happen starts a search for the first of them among steps from the same state, so the event is
     as accurate as the method, and the laws hold there. If the dense output shows that a sign change is undone within
@@ -306,7 +308,7 @@ def apply_event_detection(
 
 
 def are_event_crossings(control: StepControl, values_before, values_after) -> jax.Array:
-    """Return whether each event function changes its sign between two values in the direction of its events."""
+    """Return for each event function whether its values change sign in the direction of its events."""
     directions = np.asarray(control.event_directions)
     is_falling = (values_before > 0.0) & (values_after <= 0.0) & (directions <= 0)
     return is_falling | ((values_before < 0.0) & (values_after >= 0.0) & (directions >= 0))
@@ -342,6 +344,7 @@ def first_undone_sign_change_in_step(
 def initial_adaptive_state_program(
     system: System, method: OneStepMethod, control: StepControl, x, t, stop_time, span_length
 ) -> AdaptiveState:
+    """Return :func:`initial_adaptive_state`, computed by one compiled program."""
     return initial_adaptive_state(system, method, control, x, t, stop_time, span_length)
 
 
@@ -353,32 +356,32 @@ def advance_adaptive(
     adaptive_state: AdaptiveState,
     max_attempts,
     options: SolverOptions,
-    newton: bool = True,
+    with_newton: bool = True,
 ) -> AdaptiveState:
     """Return the adaptive state after up to ``max_attempts`` attempts; the run stops where it pauses.
 
-    Without ``newton`` it also stops before the first attempt that needs Newton's method.
+    Without ``with_newton`` it also stops before the first attempt that needs Newton's method.
     """
-    newton_fallback = None if newton else keep_fixed_point_result
+    newton_fallback = None if with_newton else keep_fixed_point_result
 
-    def continues(carry):
+    def should_continue(carry):
         adaptive_state, n_attempts = carry
         return (
             (adaptive_state.state.status == StatusCode.COMPLETED)
             & (n_attempts < max_attempts)
-            & (newton | (adaptive_state.last_attempt_status == StatusCode.COMPLETED))
+            & (with_newton | (adaptive_state.last_attempt_status == StatusCode.COMPLETED))
         )
 
     def attempt_once(carry):
         adaptive_state, n_attempts = carry
         next_state = attempt_step(system, method, control, adaptive_state, options, newton_fallback)
-        if not newton:
+        if not with_newton:
             is_solved = next_state.last_attempt_status == StatusCode.COMPLETED
             unsolved_state = adaptive_state._replace(last_attempt_status=next_state.last_attempt_status)
             next_state = jax.tree_util.tree_map(lambda a, b: jnp.where(is_solved, a, b), next_state, unsolved_state)
         return next_state, n_attempts + 1
 
-    return jax.lax.while_loop(continues, attempt_once, (adaptive_state, jnp.zeros((), dtype=jnp.int64)))[0]
+    return jax.lax.while_loop(should_continue, attempt_once, (adaptive_state, jnp.zeros((), dtype=jnp.int64)))[0]
 
 
 def advance_adaptive_on_host(
@@ -389,7 +392,7 @@ def advance_adaptive_on_host(
     adaptive_state: AdaptiveState,
     max_attempts: int,
 ) -> AdaptiveState:
-    """Return the adaptive state after up to ``max_attempts`` attempts, with steps by ``step(state, h)`` on the host."""
+    """Return the adaptive state after up to ``max_attempts`` attempts of ``step_function(state, h)`` on the host."""
     for _ in range(max_attempts):
         if int(adaptive_state.state.status) != StatusCode.COMPLETED:
             break
@@ -402,9 +405,11 @@ def advance_adaptive_on_host(
 
 @jit_cached
 def _next_step_size_and_end_time_program(control, adaptive_state):
+    """Return :func:`next_step_size_and_end_time`, computed by one compiled program."""
     return next_step_size_and_end_time(control, adaptive_state)
 
 
 @jit_cached
 def _accept_or_reject_program(system, method, control, adaptive_state, h, time_after, new_state):
+    """Return :func:`accept_or_reject`, computed by one compiled program."""
     return accept_or_reject(system, method, control, adaptive_state, h, time_after, new_state)

@@ -20,7 +20,7 @@ from .step import SavedStates, State, initial_run_state, initial_run_state_progr
 
 
 @jit_cached
-def advance(
+def take_steps_and_save(
     system: System,
     method: OneStepMethod,
     state: State,
@@ -30,19 +30,20 @@ def advance(
     capacity: int,
     options: SolverOptions = DEFAULT_OPTIONS,
     noise=None,
-    newton: bool = True,
+    with_newton: bool = True,
     first_step=None,
 ):
-    """Take ``save_every`` steps of size h, save, and repeat this ``n_saves`` times; stop at a failed step.
+    """Take ``save_every`` steps of size h, save the state, and repeat this ``n_saves`` times unless a step fails.
 
     ``h``, ``n_saves <= capacity`` and ``save_every`` are arrays, so one program serves all values. Returns the new
     state and four arrays with ``capacity`` rows: state vectors, energies, entropies, and whether the save was reached.
-    ``noise`` has the increments of each step, shape (steps, increments), or is None. Without ``newton`` a step fails if
-    fixed-point iteration does not solve its equations. A call that continues another one passes its ``first_step``, the
-    number of the first step of that call: it takes the remaining steps and fills the remaining saves.
+    ``noise`` has the increments of each step, shape (steps, increments), or is None. Without ``with_newton`` a step
+    fails if fixed-point iteration does not solve its equations. A call that continues another one passes its
+    ``first_step``, the number of the first step of that call: it takes the remaining steps and fills the remaining
+    saves.
     """
     first_step = state.step if first_step is None else first_step
-    newton_fallback = None if newton else keep_fixed_point_result
+    newton_fallback = None if with_newton else keep_fixed_point_result
     system, method, state, restore_order = reorder_components(system, method, state, options)
 
     def step(s: State) -> State:
@@ -53,10 +54,10 @@ def advance(
         state, saved_arrays = carry
         target_step = first_step + (index + 1) * save_every
 
-        def continues(s: State):
+        def should_continue(s: State):
             return (s.status == StatusCode.COMPLETED) & (s.step < target_step)
 
-        state = jax.lax.while_loop(continues, step, state)
+        state = jax.lax.while_loop(should_continue, step, state)
         values = restore_order(state).x, state.energy, state.entropy, state.status == StatusCode.COMPLETED
         return state, jax.tree_util.tree_map(lambda array, one: array.at[index].set(one), saved_arrays, values)
 
@@ -75,12 +76,12 @@ MAX_SAVED_VALUES_PER_CALL = 2**16
 
 
 def max_saves_per_call(system: System) -> int:
-    """Return the largest number of saves per call, one number for all runs so that they share a program."""
+    """Return the largest number of states that one call saves, the same for all runs, which so share a program."""
     return min(MAX_SAVES_PER_CALL, max(1, MAX_SAVED_VALUES_PER_CALL // system.dim))
 
 
 class LazyNewton:
-    """Compile steps without Newton's method first, and with it once a step does not converge.
+    """Compiler of steps that leaves Newton's method out of the program until a step does not converge.
 
     The call resumes at the failed step. Newton's method is two thirds of what there is to compile.
     """
@@ -90,20 +91,22 @@ class LazyNewton:
         self.has_newton = not isinstance(method, OneStepMethod) or method.explicit
 
     def advance_fixed_steps(self, call: Callable, state: State, save_every) -> tuple[State, tuple]:
-        """Return ``call(state, with_newton, first_step)``, with Newton's method once a step needs it."""
+        """Return ``call(state, with_newton, first_step)``, repeated with Newton's method if a step needs it."""
         first_step = state.step
-        state, saved = call(state, self.has_newton, first_step)
+        state, saved_arrays = call(state, self.has_newton, first_step)
         needs_newton = np.isin(state.status, FAILED_STEP_CODES)
         if self.has_newton or not needs_newton.any():
-            return state, saved
+            return state, saved_arrays
         self.has_newton = True
-        is_saved = np.arange(saved[-1].shape[-1]) < (np.asarray(state.step - first_step) // save_every)[..., None]
-        state, saved_later = call(state._replace(status=jnp.where(needs_newton, 0, state.status)), True, first_step)
-        masks = [is_saved.reshape(*is_saved.shape, *[1] * (a.ndim - is_saved.ndim)) for a in saved]
-        return state, tuple(jnp.where(mask, a, b) for mask, a, b in zip(masks, saved, saved_later, strict=True))
+        is_saved = (
+            np.arange(saved_arrays[-1].shape[-1]) < (np.asarray(state.step - first_step) // save_every)[..., None]
+        )
+        state, later_arrays = call(state._replace(status=jnp.where(needs_newton, 0, state.status)), True, first_step)
+        masks = [is_saved.reshape(*is_saved.shape, *[1] * (a.ndim - is_saved.ndim)) for a in saved_arrays]
+        return state, tuple(jnp.where(mask, a, b) for mask, a, b in zip(masks, saved_arrays, later_arrays, strict=True))
 
     def advance_adaptive(self, call: Callable, adaptive_state):
-        """Return ``call(adaptive_state, with_newton)``, with Newton's method once a step needs it."""
+        """Return ``call(adaptive_state, with_newton)``, repeated with Newton's method if a step needs it."""
         adaptive_state = call(adaptive_state, self.has_newton)
         if self.has_newton or not np.isin(adaptive_state.last_attempt_status, FAILED_STEP_CODES).any():
             return adaptive_state
@@ -112,7 +115,7 @@ class LazyNewton:
 
 
 class ArrayEngine:
-    """Array engine for one system and method.
+    """The array engine, which runs compiled JAX programs, for one system and method.
 
     Attributes
     ----------
@@ -132,7 +135,7 @@ class ArrayEngine:
         return initial_run_state_program(self.system, self.method, x)
 
     def advance(self, state: State, h, n_saves: int, save_every: int, noise=None):
-        """Take ``save_every`` steps up to ``n_saves <= max_saves_per_call`` times: see :func:`advance`."""
+        """Take ``n_saves`` times ``save_every`` steps, and return state and saves: see :func:`take_steps_and_save`."""
         arguments = (
             jnp.asarray(h),
             jnp.asarray(n_saves),
@@ -142,7 +145,7 @@ class ArrayEngine:
             pad_noise_increments(noise),
         )
         return self._lazy_newton.advance_fixed_steps(
-            lambda s, *how: advance(self.system, self.method, s, *arguments, *how), state, save_every
+            lambda s, *how: take_steps_and_save(self.system, self.method, s, *arguments, *how), state, save_every
         )
 
     def start(self, x) -> EngineTrajectory:
@@ -154,7 +157,7 @@ class ArrayEngine:
         return self.advance(state, h, 1, 1, noise)[0]
 
     def step_ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
-        """Return the ends of single steps of sizes h from states x, shape (m, n); NaN if a step fails.
+        """Return the states, shape (m, n), after one step of size h from each state of x; NaN if a step fails.
 
         Each is the first step of a run of its own.
         """
@@ -170,7 +173,7 @@ class ArrayEngine:
 
 
 class EngineTrajectory:
-    """One trajectory of an engine that takes a state and returns a new one.
+    """One trajectory of an engine whose steps map a state to a new one.
 
     Attributes
     ----------
@@ -200,6 +203,8 @@ STEP_ENDS_PER_CALL = 64
 
 @jit_cached
 def _step_ends_program(system: System, method: OneStepMethod, x, h, options: SolverOptions):
+    """Return the states after one step from each state of x, NaN for failed steps, in one program."""
+
     def end_of_step(inputs):
         x_start, step_size = inputs
         new_state = take_step(system, method, initial_run_state(system, method, x_start), step_size, options)
@@ -209,7 +214,7 @@ def _step_ends_program(system: System, method: OneStepMethod, x, h, options: Sol
 
 
 def pad_noise_increments(noise) -> jax.Array | None:
-    """Return noise increments zero-padded to a power of two of steps: few shapes, few programs.
+    """Return noise increments padded with zeros to a power of two of steps, so that few programs are compiled.
 
     Short calls share one program: padding up to :data:`MAX_SAVED_VALUES_PER_CALL` increments costs nothing.
     """
@@ -222,7 +227,7 @@ def pad_noise_increments(noise) -> jax.Array | None:
 
 
 class ArrayBatch:
-    """Trajectories of a family in one vmapped program, with steps of given sizes.
+    """Trajectories of a family of systems, advanced in one vmapped program by steps of given sizes.
 
     Parameters
     ----------
@@ -263,6 +268,8 @@ class ArrayBatch:
 
 @jit_cached
 def _initial_states_of_batch(structure, parameters, axes, method, x) -> State:
+    """Return the states at the start of the runs of a batch, with a leading axis of trajectories."""
+
     def initial_state_of_one(p, x):
         return initial_run_state_program(structure.rebuild(p), method, x)
 
@@ -281,11 +288,13 @@ def _advance_batch(
     steps_per_save,
     capacity: int,
     noise,
-    newton: bool,
+    with_newton: bool,
     first_steps,
 ):
+    """Return the states of a batch after steps, and its saves, as :func:`take_steps_and_save` does for one."""
+
     def advance_one(p, state, h, noise, first_step):
-        arguments = h, n_saves, steps_per_save, capacity, DEFAULT_OPTIONS, noise, newton, first_step
-        return advance(structure.rebuild(p), method, state, *arguments)
+        arguments = h, n_saves, steps_per_save, capacity, DEFAULT_OPTIONS, noise, with_newton, first_step
+        return take_steps_and_save(structure.rebuild(p), method, state, *arguments)
 
     return jax.vmap(advance_one, in_axes=(axes, 0, 0, 0, 0))(parameters, state, h, noise, first_steps)

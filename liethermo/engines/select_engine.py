@@ -57,7 +57,7 @@ class CompiledEngineWarning(UserWarning):
 
 
 class EngineWithFallback:
-    """The engine of a run, chosen when the run begins; it has the methods of an :class:`Engine`.
+    """The engine of a run, chosen at its start, with the array engine as a fallback; see :class:`Engine`.
 
     With "auto", the array engine takes over if the compiled engine meets a primitive that it cannot unroll, or fails:
     at the start, or when a step first needs Newton's method. The run resumes from the last good state, with a warning.
@@ -95,23 +95,26 @@ class EngineWithFallback:
 
     @property
     def name(self) -> str:
+        """Name of the engine that runs."""
         return self._engine.name
 
     @property
     def max_saves_per_call(self) -> int:
+        """Largest number of states that one call saves."""
         return self._engine.max_saves_per_call
 
     def initial_run_state(self, x) -> State:
+        """Return the state of a run that starts at x, shape (n,), after choosing the engine."""
         self._choose_engine(lambda compiled: compiled.n_operations)
         return self._call_with_fallback(lambda engine, _: engine.initial_run_state(x))
 
-    def start(self, x) -> Trajectory:
-        """Return a trajectory that starts at x, shape (n,); it ends the one that was started before."""
+    def start(self, x) -> TrajectoryWithFallback:
+        """Return a trajectory that starts at x, shape (n,); a trajectory started before becomes invalid."""
         self._choose_engine(lambda compiled: compiled.n_operations)
-        return Trajectory(self, self._call_with_fallback(lambda engine, _: engine.start(x)))
+        return TrajectoryWithFallback(self, self._call_with_fallback(lambda engine, _: engine.start(x)))
 
     def compiled_trajectory(self, is_new: bool = False) -> CompiledTrajectory | None:
-        """Return the trajectory of the compiled engine, a new one if ``is_new``; None if another engine runs."""
+        """Return the trajectory of the compiled engine, a new one if ``is_new``; None if another engine was chosen."""
         self._choose_engine(lambda compiled: compiled.n_operations)
         if not isinstance(self._engine, CompiledEngine):
             return None
@@ -120,7 +123,7 @@ class EngineWithFallback:
     def advance_trajectory(
         self, trajectory: CompiledTrajectory | EngineTrajectory, h: float, n_saves: int, steps_per_save: int
     ) -> tuple[CompiledTrajectory | EngineTrajectory, SavedStates]:
-        """Advance a trajectory of the engine; return it, or the one that replaces it, and the saved states."""
+        """Return a trajectory after steps, or its replacement on the array engine, and the saved states."""
         noise = None if self.noise is None else self._noise_increments(trajectory.state, n_saves * steps_per_save, h)
         try:
             return trajectory, trajectory.advance(h, n_saves, steps_per_save, noise)
@@ -130,12 +133,14 @@ class EngineWithFallback:
             return trajectory, trajectory.advance(h, n_saves, steps_per_save, noise)
 
     def advance(self, state: State, h, n_saves: int, save_every: int) -> tuple[State, tuple]:
+        """Return the state after up to ``n_saves`` times ``save_every`` steps, and the saved arrays."""
         noise = self._noise_increments(state, int(n_saves) * int(save_every), h)
         return self._call_with_fallback(
             lambda engine, state: engine.advance(state, h, n_saves, save_every, noise), state
         )
 
     def step(self, state: State, h) -> State:
+        """Return the state after one step of size h, or the old state with a failure status."""
         noise = self._noise_increments(state, 1, h)
         return self._call_with_fallback(lambda engine, state: engine.step(state, h, noise), state)
 
@@ -156,13 +161,15 @@ class EngineWithFallback:
         return ends
 
     def _engine_step_ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
+        """Return the states, shape (m, n), after one step from each state of x; NaN if a step fails."""
         return self._call_with_fallback(lambda engine, _: engine.step_ends(x, h))
 
-    def _noise_increments(self, state: State, steps: int, h) -> np.ndarray | None:
-        return None if self.noise is None else self.noise(int(state.step), steps, h)
+    def _noise_increments(self, state: State, n_steps: int, h) -> np.ndarray | None:
+        """Return the noise increments of the next steps, shape (steps, increments); None without noise."""
+        return None if self.noise is None else self.noise(int(state.step), n_steps, h)
 
     def start_adaptive(self, control: StepControl, x, t: float, stop_time: float, span_length: float) -> AdaptiveRuns:
-        """Start an adaptive run at x at time t; see :func:`.adaptive_steps.initial_adaptive_state`."""
+        """Return an adaptive run from x at time t, on the engine that is chosen for it."""
         self._choose_engine(lambda compiled: compiled.adaptive_step_loop(control)[0].n_operations)
 
         def start_on_engine(engine: Engine, _) -> AdaptiveRuns:
@@ -179,17 +186,18 @@ class EngineWithFallback:
     def resume_adaptive_on_array_engine(
         self, error: UnsupportedPrimitive, control: StepControl, adaptive_runs: AdaptiveRuns
     ) -> ArrayAdaptiveRuns:
-        """Continue an adaptive run on the array engine after the compiled engine raised UnsupportedPrimitive."""
+        """Return an adaptive run resumed on the array engine, because the compiled engine met a primitive it lacks."""
         self._fall_back(error)
         return resume_on_array_engine(self.system, self.method, control, adaptive_runs)
 
     def _choose_engine(self, count_operations: Callable[[CompiledEngine], int]) -> None:
-        """Choose an engine when the run begins; ``count_operations`` counts the operations of a compiled step."""
+        """Choose the engine at the first call; ``count_operations`` counts the operations of a compiled step."""
         if not self._is_engine_chosen:
             self._engine = self._preferred_engine(count_operations)
             self._is_engine_chosen = True
 
     def _preferred_engine(self, count_operations: Callable[[CompiledEngine], int]) -> Engine:
+        """Return the engine that suits the system, the method and the user's request."""
         system, method, is_auto = self.system, self.method, self.requested_engine == "auto"
         if self.requested_engine == "sparse" and self.noise is not None:
             raise InputError("the sparse engine cannot take steps with noise. Leave out engine=")
@@ -205,7 +213,7 @@ class EngineWithFallback:
                     f"the sparse engine cannot run a {system.kind} that does not know its sparsity. Build the system "
                     "as a ComposedSystem of lt.Copies joined by lt.Each"
                 )
-        repays_compiling = self.planned_steps >= MIN_STEPS_TO_COMPILE or system.hints.has_matrix_functions
+        repays_compiling = self.planned_steps >= MIN_STEPS_TO_COMPILE or system.engine_hints.has_matrix_functions
         if self.requested_engine == "compiled" or (is_auto and is_worth_compiling(system, method)):
             compiled = CompiledEngine(system, method, planned_steps=self.planned_steps)
             try:
@@ -224,7 +232,7 @@ class EngineWithFallback:
         return ArrayEngine(system, method)
 
     def _call_with_fallback(self, call: Callable[[Engine, Any], Any], state: State | None = None) -> Any:
-        """Return ``call(engine, state)``, on the array engine if the compiled one raises UnsupportedPrimitive."""
+        """Return ``call(engine, state)``, repeated on the array engine if the compiled one lacks a primitive."""
         try:
             return call(self._engine, state)
         except UnsupportedPrimitive as error:
@@ -232,11 +240,12 @@ class EngineWithFallback:
             return call(self._engine, None if state is None else self._to_array_state(state))
 
     def _to_array_state(self, state: State) -> State:
-        """Return a state of the compiled engine as one of the array engine."""
+        """Return a state of the compiled engine converted to one of the array engine."""
         template = self._engine.initial_run_state(jnp.asarray(state.x))
         return jax.tree_util.tree_map(lambda a, b: jnp.asarray(a, b.dtype), state, template)
 
     def _fall_back(self, error: UnsupportedPrimitive) -> None:
+        """Replace the engine by the array engine with a warning; raise the error if the user asked for an engine."""
         if self.requested_engine != "auto":
             raise error
         warn_of_fallback(error)
@@ -244,8 +253,8 @@ class EngineWithFallback:
         self._engine = ArrayEngine(self.system, self.method)
 
 
-class Trajectory:
-    """One trajectory of a run; the array engine takes it over if the compiled engine cannot go on."""
+class TrajectoryWithFallback:
+    """One trajectory of a run, continued on the array engine if the compiled engine cannot continue it."""
 
     def __init__(self, engine: EngineWithFallback, trajectory: CompiledTrajectory | EngineTrajectory):
         self._engine, self._trajectory = engine, trajectory
@@ -269,9 +278,9 @@ class Trajectory:
 
 
 def is_worth_compiling(system: System, method: OneStepMethod) -> bool:
-    """Return whether compiling a step may pay off: it can be unrolled, has few components, and runs on the CPU."""
-    hints = system.hints
-    can_unroll = hints.can_unroll and (method.explicit or hints.can_unroll_newton)
+    """Return whether compiling a step may pay off: it is unrollable, of few components, and on the CPU."""
+    engine_hints = system.engine_hints
+    can_unroll = engine_hints.can_unroll and (method.explicit or engine_hints.can_unroll_newton)
     return can_unroll and system.dim <= MAX_COMPILED_DIM and jax.default_backend() == "cpu"
 
 

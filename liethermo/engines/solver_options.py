@@ -15,7 +15,7 @@ from ..integrators.levels import LEVEL_RTOL_OF_STATE, LEVEL_RTOL_OF_STEP
 
 @dataclass(frozen=True)
 class SolverOptions:
-    """Limits and tolerances of the iterations that solve the stage equations, for every engine.
+    """Limits and tolerances of the solvers of the stage equations, the same for every engine.
 
     Updates of the slopes k are measured relative to ``|x|/h + |k|``. The norm is the maximum norm, or for systems of
     many components the root mean square. Neither grows with the dimension, but the largest component is the one where
@@ -94,15 +94,17 @@ class SolverOptions:
     large_offset_ratio: float = 100.0
 
     def norm_for_dim(self, dim: int) -> Callable[[jax.Array], jax.Array]:
-        """Return the norm of vectors, shape (n,) or (stages, n), for systems of dimension ``dim``."""
+        """Return the function that measures slopes of systems of dimension ``dim``: maximum or root mean square."""
         return _rms_norm if dim > self.rms_norm_dim else _max_norm
 
 
 def _max_norm(v) -> jax.Array:
+    """Return the largest absolute value of the entries."""
     return jnp.max(jnp.abs(v))
 
 
 def _rms_norm(v) -> jax.Array:
+    """Return the root mean square of all entries."""
     return jnp.linalg.norm(v) / math.sqrt(v.size)
 
 

@@ -27,7 +27,7 @@ from .array_engine import EngineTrajectory
 from .solver_options import DEFAULT_OPTIONS
 from .stage_solver import IterationState, StageEquations, StageSolution, best_guess_and_residual, solve_fixed_point
 from .status_codes import StatusCode
-from .step import State, finish_step, initial_run_state_program, stage_equations, system_and_state_at_step_start
+from .step import State, finish_step, initial_run_state_program, stage_equations, system_and_state_after_jump
 
 MAX_FRONT_WIDTH = 1_000
 """Largest width of a level of a breadth-first search for which a matrix is factorised.
@@ -48,7 +48,7 @@ MAX_KRYLOV_ITERATIONS = 2_000
 
 
 class JacobianCompression:
-    """Compression of a sparse Jacobian matrix: all its entries from few Jacobian-vector products.
+    """Computation of all entries of a sparse Jacobian matrix from few products with vectors.
 
     Columns without a common row get one colour and are computed together, by a derivative along their sum [Curtis,
     Powell & Reid 1974]. Dense rows (of *hubs*) would need as many colours as they have entries; they are computed one
@@ -81,11 +81,11 @@ class JacobianCompression:
 
     @property
     def n_derivatives(self) -> int:
-        """Return the number of directional derivatives (jvp and vjp) that one Jacobian matrix takes."""
+        """Number of products with vectors (jvp and vjp) that one Jacobian matrix takes."""
         return self.stages * (len(self._colour_entries) + len(self.dense_rows))
 
     def assemble_jacobian(self, jvp: Callable, vjp: Callable) -> scipy.sparse.csc_array:
-        """Return the Jacobian matrix, shape (stages n, stages n).
+        """Return the Jacobian matrix, shape (stages n, stages n), from its products with vectors.
 
         Parameters
         ----------
@@ -118,8 +118,8 @@ class JacobianCompression:
         return scipy.sparse.csc_array((np.concatenate(entries), indices), (self.stages * n, self.stages * n))
 
 
-class SparseInverse:
-    """Solver of ``matrix @ x = b``, by factorisation if elimination fills little, else by Krylov iteration.
+class SparseLinearSolver:
+    """Solver of ``matrix @ x = b`` by sparse factors, or by a Krylov iteration if the factors would be dense.
 
     Parameters
     ----------
@@ -158,11 +158,12 @@ class SparseInverse:
         self._solve = solve_bicgstab
 
     def __call__(self, b: np.ndarray) -> np.ndarray:
+        """Return the solution x, shape (n,), of ``matrix @ x = b``."""
         return self._solve(b)
 
 
 def _max_coloured_row_size(row_sizes: np.ndarray) -> int:
-    """Return the largest number of entries of a row that is coloured.
+    """Return the number of entries up to which a row is coloured, chosen to need the fewest derivatives.
 
     About as many colours are needed, and a derivative for each larger row: their sum is minimised.
     """
@@ -172,7 +173,7 @@ def _max_coloured_row_size(row_sizes: np.ndarray) -> int:
 
 
 def _max_bfs_level_width(pattern: scipy.sparse.csr_array) -> int:
-    """Return the number of nodes in the widest level of a breadth-first search through the largest component.
+    """Return the number of nodes in the widest level of a breadth-first search through a pattern's graph.
 
     The search starts at a peripheral node.
     """
@@ -187,7 +188,7 @@ def _max_bfs_level_width(pattern: scipy.sparse.csr_array) -> int:
 
 
 def _colour_columns(pattern: scipy.sparse.csr_array) -> np.ndarray:
-    """Return a colour for each column, greedily and in order, so that no row has two columns of one colour."""
+    """Return a colour number for each column, so that columns of one colour have no row in common."""
     csc_pattern = scipy.sparse.csc_array(pattern)
     rows = csc_pattern.indices.tolist()
     row_colours = [0] * pattern.shape[0]  # for each row, a bit mask of the colours of its columns
@@ -219,7 +220,7 @@ and the norm is the maximum norm, because a root mean square could hide a few st
 
 
 class SparseEngine:
-    """Sparse engine for one system and method; the factors of its Jacobian matrix are kept from step to step.
+    """The sparse engine, which solves steps by sparse Newton iteration, for one system and method.
 
     Raises
     ------
@@ -237,14 +238,15 @@ class SparseEngine:
             raise ValueError(f"{type(system).__name__} does not know its sparsity")
         self._pattern = pattern
         self._compression: JacobianCompression | None = None
-        self._inverse: SparseInverse | None = None
+        self._jacobian_solver: SparseLinearSolver | None = None
         self._factored_step_size = np.nan
 
     def initial_run_state(self, x) -> State:
+        """Return the state of a run that starts at x, shape (n,)."""
         return initial_run_state_program(self.system, self.method, x)
 
     def advance(self, state, h, n_saves, save_every, noise=None):
-        """Take ``save_every`` steps up to ``n_saves`` times; the saved arrays have only the saves that were reached."""
+        """Return the state after up to ``n_saves`` times ``save_every`` steps, and arrays of the saves reached."""
         del noise  # this engine takes no steps with noise
         saved_states: list[State] = []
         for _ in range(int(n_saves)):
@@ -260,9 +262,11 @@ class SparseEngine:
         return state, (x, energy, entropy, np.ones(len(saved_states), dtype=bool))
 
     def start(self, x) -> EngineTrajectory:
+        """Return a trajectory that starts at x, shape (n,)."""
         return EngineTrajectory(self, self.initial_run_state(x))
 
     def step_ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
+        """Return the states, shape (m, n), after one step of size h from each state of x; NaN if a step fails."""
         states = [
             self.step(self.initial_run_state(jnp.asarray(start)), step_size)
             for start, step_size in zip(x, h, strict=True)
@@ -271,6 +275,7 @@ class SparseEngine:
         return np.where(is_taken[:, None], np.array([np.asarray(s.x) for s in states]), np.nan)
 
     def step(self, state: State, h, noise=None) -> State:
+        """Return the state after one step of size h, or the old state with a failure status."""
         del noise
         h = jnp.asarray(h, dtype=jnp.float64)
         solution = _solve_fixed_point_program(self.system, self.method, state, h)
@@ -281,6 +286,7 @@ class SparseEngine:
     # -- Newton's method ------------------------------------------------------------------------------------------
 
     def _solve_newton(self, state: State, h, n_fixed_point: int) -> StageSolution:
+        """Return the solution of the stage equations by Newton's method, after ``n_fixed_point`` other iterations."""
         k, residual, scale = _best_guess_with_residual_and_scale(self.system, self.method, state, h)
         s, needs_jacobian = IterationState.initial(k), float(h) != self._factored_step_size
         slope_rounding = jnp.zeros(())
@@ -288,9 +294,9 @@ class SparseEngine:
             not self._has_converged(s, scale, residual, slope_rounding)
             and int(s.n_iterations) < SPARSE_SOLVER_OPTIONS.max_newton_iterations
         ):
-            if needs_jacobian or self._inverse is None:
-                self._inverse, self._factored_step_size = self._jacobian_inverse(state, h, s.k), float(h)
-                if self._inverse is None:
+            if needs_jacobian or self._jacobian_solver is None:
+                self._jacobian_solver, self._factored_step_size = self._make_jacobian_solver(state, h, s.k), float(h)
+                if self._jacobian_solver is None:
                     break
             newton_step = self._damped_newton_step(
                 state,
@@ -298,7 +304,7 @@ class SparseEngine:
                 s,
                 residual,
                 scale,
-                self._inverse,
+                self._jacobian_solver,
                 SPARSE_SOLVER_OPTIONS.max_newton_halvings if needs_jacobian else 1,
             )
             if newton_step is None and needs_jacobian:
@@ -331,34 +337,46 @@ class SparseEngine:
         )
 
     @staticmethod
-    def _has_converged(s: IterationState, scale, residual, slope_rounding) -> bool:
-        is_at_limit = s.n_iterations >= SPARSE_SOLVER_OPTIONS.max_newton_iterations
+    def _has_converged(iteration_state: IterationState, scale, residual, slope_rounding) -> bool:
+        """Return whether Newton's iteration has converged."""
+        is_at_limit = iteration_state.n_iterations >= SPARSE_SOLVER_OPTIONS.max_newton_iterations
         residual_norm = jnp.max(jnp.abs(residual))
-        return bool(s.has_newton_converged(is_at_limit, scale, SPARSE_SOLVER_OPTIONS, residual_norm, slope_rounding))
+        return bool(
+            iteration_state.has_newton_converged(
+                is_at_limit, scale, SPARSE_SOLVER_OPTIONS, residual_norm, slope_rounding
+            )
+        )
 
     def _damped_newton_step(
-        self, state, h, s: IterationState, residual, scale, inverse: SparseInverse, max_trials: int
+        self,
+        state,
+        h,
+        iteration_state: IterationState,
+        residual,
+        scale,
+        linear_solver: SparseLinearSolver,
+        max_trials: int,
     ):
-        """Return state, residual and scale after a Newton step, halved until the residual decreases, or None.
+        """Return iteration state, residual and scale after a Newton step, halved as needed; None if none helps.
 
         At the rounding plateau the residual does not decrease, and a full step is taken.
         """
-        step = inverse(np.asarray(residual).ravel()).reshape(s.k.shape)
+        step = linear_solver(np.asarray(residual).ravel()).reshape(iteration_state.k.shape)
         if not np.isfinite(step).all():
             return None
         norm = float(jnp.linalg.norm(residual))
         for _ in range(max_trials):
-            k = s.k - step
+            k = iteration_state.k - step
             new_residual, new_scale = _weighted_residual_and_scale(self.system, self.method, state, h, k)
             new_norm = float(jnp.linalg.norm(new_residual))
             is_rounding = float(np.abs(step).max()) <= SPARSE_SOLVER_OPTIONS.plateau_rtol * float(scale)
             if new_norm < norm or (is_rounding and np.isfinite(new_norm)):
-                return s.next_state(k, SPARSE_SOLVER_OPTIONS), new_residual, new_scale
+                return iteration_state.next_state(k, SPARSE_SOLVER_OPTIONS), new_residual, new_scale
             step = 0.5 * step
         return None
 
-    def _jacobian_inverse(self, state, h, k) -> SparseInverse | None:
-        """Return the solver of the weighted Newton equations at k; None if its matrix is singular."""
+    def _make_jacobian_solver(self, state, h, k) -> SparseLinearSolver | None:
+        """Return the solver of the linear equations of a Newton step at k; None if the matrix is singular."""
         if self._compression is None:
             self._compression = JacobianCompression(self._pattern, self.method.stages)
 
@@ -369,7 +387,7 @@ class SparseEngine:
             return _weighted_residual_vjp(self.system, self.method, state, h, k, seed)
 
         try:
-            return SparseInverse(self._compression.assemble_jacobian(jvp, vjp), self._compression.front_width)
+            return SparseLinearSolver(self._compression.assemble_jacobian(jvp, vjp), self._compression.front_width)
         except np.linalg.LinAlgError:
             return None
 
@@ -379,11 +397,13 @@ class SparseEngine:
 
 @jit_cached
 def _solve_fixed_point_program(system: System, method: OneStepMethod, state: State, h) -> StageSolution:
+    """Return the solution of the stage equations by fixed-point iteration, in one program."""
     return solve_fixed_point(_stage_equations(system, method, state, h), SPARSE_SOLVER_OPTIONS)
 
 
 def _stage_equations(system: System, method: OneStepMethod, state: State, h) -> StageEquations:
-    system, x = system_and_state_at_step_start(system, state.x, state.energy)
+    """Return the stage equations of a step from a state, after a jump of the energy at a break."""
+    system, x = system_and_state_after_jump(system, state.x, state.energy)
     return stage_equations(
         system, method, x, state.compensation, h, state.k, state.previous_slopes, SPARSE_SOLVER_OPTIONS
     )
@@ -391,12 +411,13 @@ def _stage_equations(system: System, method: OneStepMethod, state: State, h) -> 
 
 @jit_cached
 def _finish_step_program(system: System, method: OneStepMethod, state: State, h, solution: StageSolution) -> State:
-    system, x = system_and_state_at_step_start(system, state.x, state.energy)
+    """Return the state after a step with solved stage equations, in one program."""
+    system, x = system_and_state_after_jump(system, state.x, state.energy)
     return finish_step(system, method, state._replace(x=x), h, solution, SPARSE_SOLVER_OPTIONS)
 
 
 def _weighted_residual_guess_and_scale(system: System, method: OneStepMethod, state: State, h):
-    """Return the function ``k -> w (slopes(k) - k)``, a guess of k, and the scale that updates are compared with.
+    """Return the weighted residual as a function of k, a guess of k, and the scale of updates of k.
 
     With the weights w of :attr:`liethermo.System.sparse_newton` a stiff step is nearest to linear.
     """
@@ -411,13 +432,14 @@ def _weighted_residual_guess_and_scale(system: System, method: OneStepMethod, st
 
 @jit_cached
 def _weighted_residual_and_scale(system: System, method: OneStepMethod, state: State, h, k) -> tuple[Any, Any]:
+    """Return the weighted residual at k, shape (stages, n), and the scale of updates of k."""
     residual, _, scale = _weighted_residual_guess_and_scale(system, method, state, h)
     return residual(k), scale(k)
 
 
 @jit_cached
 def _residual_rounding_scale(system: System, method: OneStepMethod, x) -> Any:
-    """Return the scale at which the weighted residual is rounded."""
+    """Return the scale of the rounding error of the weighted residual, shape ()."""
     return jnp.max(
         value_and_rounding_scale(lambda x: system.sparse_newton.residual_weights(x) * system.vector_field(x), x)[1]
     )
@@ -425,7 +447,7 @@ def _residual_rounding_scale(system: System, method: OneStepMethod, x) -> Any:
 
 @jit_cached
 def _best_guess_with_residual_and_scale(system: System, method: OneStepMethod, state: State, h):
-    """Return the predicted slopes, or zero slopes if their residual is smaller, with residual and scale."""
+    """Return the guess of the slopes with the smaller residual, predicted or zero, with residual and scale."""
     residual_function, guess, scale = _weighted_residual_guess_and_scale(system, method, state, h)
     k, residual = best_guess_and_residual(residual_function, guess)
     return k, residual, scale(k)
@@ -433,11 +455,13 @@ def _best_guess_with_residual_and_scale(system: System, method: OneStepMethod, s
 
 @jit_cached
 def _weighted_residual_jvp(system: System, method: OneStepMethod, state: State, h, k, seed):
+    """Return the product of the Jacobian of the weighted residual at k with a vector, shape (stages, n)."""
     residual = _weighted_residual_guess_and_scale(system, method, state, h)[0]
     return jax.jvp(residual, (k,), (jnp.asarray(seed),))[1]
 
 
 @jit_cached
 def _weighted_residual_vjp(system: System, method: OneStepMethod, state: State, h, k, seed):
+    """Return the product of the transposed Jacobian of the weighted residual with a vector, shape (stages, n)."""
     residual = _weighted_residual_guess_and_scale(system, method, state, h)[0]
     return jax.vjp(residual, k)[1](jnp.asarray(seed))[0]

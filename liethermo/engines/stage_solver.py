@@ -26,7 +26,7 @@ from .solver_options import DEFAULT_OPTIONS, SolverOptions
 
 
 class StageSolution(NamedTuple):
-    """Solution of the stage equations, and how the iteration ended."""
+    """The solution of the stage equations of a step, with how the iteration ended."""
 
     k: jax.Array
     converged: jax.Array
@@ -38,7 +38,7 @@ class StageSolution(NamedTuple):
 
 
 class StageEquations(NamedTuple):
-    """Stage equations ``k = slopes(k)`` of one step, with the functions that solve them."""
+    """The stage equations ``k = slopes(k)`` of one step, with what their solvers need."""
 
     slopes: Callable
     guess: jax.Array
@@ -48,7 +48,7 @@ class StageEquations(NamedTuple):
 
 
 class IterationState(NamedTuple):
-    """State of an iteration on the stage equations."""
+    """The state of an iteration on the stage equations, carried from update to update."""
 
     k: jax.Array
     update: jax.Array  # norm of the last update of k
@@ -61,10 +61,12 @@ class IterationState(NamedTuple):
 
     @classmethod
     def initial(cls, k) -> IterationState:
+        """Return the state of an iteration before its first update, at slopes k."""
         infinite, zero_count = jnp.asarray(jnp.inf), jnp.zeros((), dtype=jnp.int64)
         return cls(k, infinite, infinite, zero_count, infinite, jnp.zeros(()), zero_count, infinite)
 
     def next_state(self, k, options: SolverOptions) -> IterationState:
+        """Return the state of the iteration after an update to slopes k."""
         update = options.norm_for_dim(k.shape[-1])(k - self.k)
         earlier_update = jnp.where(self.n_iterations > 1, self.previous_update, 0.0)
         n_stalled = jnp.where(update < options.stall_ratio * self.smallest_update, 0, self.n_stalled + 1)
@@ -83,7 +85,7 @@ class IterationState(NamedTuple):
         return (self.update > rate * self.previous_update) & (self.update > rate * rate * self.earlier_update)
 
     def is_update_small(self, scale, options: SolverOptions, residual_norm=None, slope_rounding=None) -> jax.Array:
-        """Return whether the update is as small relative to ``scale`` as rounding may leave it.
+        """Return whether the last update is within the size that rounding may leave, relative to ``scale``.
 
         With ``slope_rounding``, a residual that is small relative to it will do instead.
         """
@@ -102,12 +104,12 @@ class IterationState(NamedTuple):
     def has_newton_converged(
         self, is_at_limit, scale, options: SolverOptions, residual_norm, slope_rounding
     ) -> jax.Array:
-        """Return whether a Newton iteration has converged; at its limit the update may still shrink below rounding."""
+        """Return whether a Newton iteration has converged: at the rounding plateau, or small at its limit."""
         criteria = scale, options, residual_norm, slope_rounding
         return self.is_update_at_rounding_plateau(*criteria) | (is_at_limit & self.is_update_small(*criteria))
 
     def has_fixed_point_converged_and_continues(self, scale, options: SolverOptions) -> tuple[jax.Array, jax.Array]:
-        """Return whether a fixed-point iteration has converged, and whether it goes on."""
+        """Return two bools: whether a fixed-point iteration has converged, and whether it goes on."""
         is_slow = (
             (self.n_iterations >= 3)
             & self.shrinks_slower_than(options.fixed_point_contraction_limit)
@@ -125,7 +127,7 @@ class IterationState(NamedTuple):
 
 
 def solve_fixed_point(equations: StageEquations, options: SolverOptions = DEFAULT_OPTIONS) -> StageSolution:
-    """Solve the stage equations by fixed-point iteration, which is given up if it converges slowly."""
+    """Return the solution of the stage equations by fixed-point iteration, given up if it converges slowly."""
 
     def iterate(carry):
         s = carry[0].next_state(equations.slopes(carry[0].k), options)
@@ -139,13 +141,13 @@ def solve_fixed_point(equations: StageEquations, options: SolverOptions = DEFAUL
 
 
 def slope_rounding_scale(system: System, x, options: SolverOptions = DEFAULT_OPTIONS) -> jax.Array:
-    """Return the norm of the scales at which the components of the vector field at x are rounded."""
+    """Return the norm of the rounding errors of the vector field at x, shape ()."""
     system, x = system.solved_subsystem(x)
     return options.norm_for_dim(x.size)(value_and_rounding_scale(system.vector_field, x)[1])
 
 
 def solve_stages(equations: StageEquations, options: SolverOptions = DEFAULT_OPTIONS) -> StageSolution:
-    """Solve the stage equations by fixed-point iteration, and by Newton's method if that fails."""
+    """Return the solution of the stage equations by fixed-point iteration, or by Newton's method if that fails."""
     fixed_point_result = solve_fixed_point(equations, options)
     # a branch, because a loop would copy its carry
     return jax.lax.cond(
@@ -156,14 +158,14 @@ def solve_stages(equations: StageEquations, options: SolverOptions = DEFAULT_OPT
 
 
 def keep_fixed_point_result(fixed_point_result: StageSolution, *_) -> StageSolution:
-    """Return the result of the fixed-point iteration, without Newton's method."""
+    """Return the result of the fixed-point iteration unchanged, in place of Newton's method."""
     return fixed_point_result
 
 
 def solve_newton(
     equations: StageEquations, options: SolverOptions, fixed_point_result: StageSolution | None = None
 ) -> StageSolution:
-    """Solve the stage equations by simplified Newton iteration, unless fixed-point iteration has solved them.
+    """Return the solution of the stage equations by simplified Newton iteration, unless they are solved already.
 
     Under ``vmap`` it leaves the trajectories unchanged whose equations are solved. Full steps are tried first; a failed
     iteration restarts once from the guess with damped steps.
@@ -259,7 +261,7 @@ def solve_newton(
 
 
 def best_guess_and_residual(residual_function: Callable, guess: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the guess, or zero slopes if their residual is smaller, and the residual there.
+    """Return the guess of the slopes with the smaller residual, given or zero, and this residual.
 
     Far from a solution Newton's method may wander.
     """
@@ -304,7 +306,7 @@ mlir.register_lowering(_inverse, mlir.lower_fun(jnp.linalg.inv, multiple_results
 def explicit_stage_solution(
     system: System, method: OneStepMethod, x, compensation, h, k, options: SolverOptions = DEFAULT_OPTIONS
 ) -> StageSolution:
-    """Return the slopes of an explicit step; it has converged if its end satisfies the constraints."""
+    """Return the slopes of an explicit step as a solution, converged if its end satisfies the constraints."""
     k = method.slopes(system, x, compensation, h, k)
     x, zero_count = system.solved_subsystem(x)[1], jnp.zeros((), dtype=jnp.int64)
     norm = options.norm_for_dim(x.size)
@@ -324,7 +326,7 @@ def make_newton_lineariser(
     options: SolverOptions = DEFAULT_OPTIONS,
     map_function: Callable | None = None,
 ) -> Callable:
-    """Return a function of k that linearises the equations at k, and returns the map from a residual to Newton's step.
+    """Return a function of k that linearises the stage equations at k and returns the solver of a Newton step.
 
     ``map_function(function, vectors)`` computes the columns of the Jacobian matrix; without it ``vmap`` does, and large
     systems are solved without a matrix.
@@ -348,13 +350,13 @@ def _map_with_vmap(function: Callable, vectors) -> jax.Array:
 
 
 def scale_of_slope_updates(x, h, k, options: SolverOptions = DEFAULT_OPTIONS):
-    """Return the scale ``|x|/|h| + |k|`` of updates of the slopes."""
+    """Return the scale ``|x|/|h| + |k|``, shape (), relative to which updates of slopes are measured."""
     norm = options.norm_for_dim(x.size)
     return norm(x) / jnp.abs(h) + norm(k) + options.tiny
 
 
 def solve_krylov(matvec: Callable, b: jax.Array, options: SolverOptions) -> jax.Array:
-    """Solve ``matvec(x) = b`` to the relative residual ``options.krylov_forcing_term``; return x, of the shape of b.
+    """Return x, shaped as b, with ``matvec(x) = b`` to the relative residual ``options.krylov_forcing_term``.
 
     Conjugate residuals, each direction made orthogonal to the last few [Eisenstat, Elman & Schultz 1983, "Orthomin"].
     With all directions kept, x would have the least residual in the Krylov space; the memory is ``2

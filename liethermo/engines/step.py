@@ -14,7 +14,7 @@ from ..integrators import OneStepMethod
 from ..integrators.base import is_permutation_equivariant, pullback_method
 from ..integrators.explicit import StepRow
 from ..systems import System
-from ..systems.clock import add_jump_of_energy, clock_components, system_of_step
+from ..systems.clock import add_energy_jump_to_work, keep_clock_components, system_between_breaks
 from ..systems.spins import reorder_spins
 from ..tracing.programs import jit_unoptimised
 from .solver_options import DEFAULT_OPTIONS, EPS, SolverOptions
@@ -31,7 +31,7 @@ from .status_codes import StatusCode
 
 
 class State(NamedTuple):
-    """State of a run, carried from step to step."""
+    """The state of a run that is carried from step to step."""
 
     x: jax.Array
     compensation: jax.Array  # rounding errors of x so far (compensated summation)
@@ -58,7 +58,7 @@ class State(NamedTuple):
 
 
 class SavedStates(NamedTuple):
-    """States that a call of an engine saves, of those saves that were reached."""
+    """The states that a call of an engine saved, without those that were not reached."""
 
     x: np.ndarray  # shape (saves, n)
     energy_and_entropy: np.ndarray  # shape (saves, 2)
@@ -103,6 +103,7 @@ def initial_run_state(system: System, method: OneStepMethod, x) -> State:
 
 
 def _slopes_for_prediction(method: OneStepMethod, k) -> jax.Array:
+    """Return the slopes k that the next step needs for its prediction; none for an explicit method."""
     return k[:0] if method.explicit else k
 
 
@@ -137,8 +138,8 @@ def reorder_components(
     )
 
 
-def system_and_state_at_step_start(system: System, x, energy_before) -> tuple[System, jax.Array]:
-    """Return the system and the state vector with which a step from x starts.
+def system_and_state_after_jump(system: System, x, energy_before) -> tuple[System, jax.Array]:
+    """Return the system and the state x with which a step starts, after a jump at a break of the time span.
 
     They differ from those given only in a run with breaks, at which functions of time jump.
 
@@ -149,9 +150,9 @@ def system_and_state_at_step_start(system: System, x, energy_before) -> tuple[Sy
     energy_before : array, shape ()
         The energy at the end of the last step, before a jump.
     """
-    step_system = system_of_step(system, x)
+    step_system = system_between_breaks(system, x)
     if system.clock is not None and system.clock.can_energy_jump:
-        x = add_jump_of_energy(system.clock, x, step_system.energy.value(x) - energy_before)
+        x = add_energy_jump_to_work(system.clock, x, step_system.energy.value(x) - energy_before)
     return step_system, x
 
 
@@ -168,7 +169,7 @@ def take_step(
     An engine that has Newton's method elsewhere passes ``newton_fallback(fixed_point_result, x, compensation, h, k,
     previous_slopes)``, which replaces it.
     """
-    system, x = system_and_state_at_step_start(system, state.x, state.energy)
+    system, x = system_and_state_after_jump(system, state.x, state.energy)
     state = state._replace(x=x)
     system, method, state, restore_order = reorder_components(system, method, state, options)
     if not method.carries_compensation:
@@ -217,13 +218,13 @@ def finish_step(
     solution: StageSolution,
     options: SolverOptions = DEFAULT_OPTIONS,
 ) -> State:
-    """Return the state after a step with solved stage equations, or the old state with a failure status."""
+    """Return the state after a step whose stage equations are solved, or the old state with a failure status."""
     x, compensation = state.x, state.compensation
     end = end_of_step(system, method, x, compensation, h, solution.k)
     new_x, new_compensation, energy, entropy = end.x, end.compensation, end.energy, end.entropy
     correction = state.energy_drift_correction
     if not method.carries_compensation:  # the next step computes its own, as the first step of a run does
-        new_compensation = clock_components(system, new_compensation)
+        new_compensation = keep_clock_components(system, new_compensation)
     elif can_correct_energy_drift(system, method):  # by the error of the last step: no step waits for its own energy
         new_compensation = compensation_after_drift_correction(system, new_x, new_compensation, correction)
         correction = energy_drift_multiplier(system, new_x, new_compensation, energy, state.first_energy)
@@ -273,7 +274,7 @@ def finish_step(
 
 
 class StepEnd(NamedTuple):
-    """State vector at the end of a step, with the values of the functions there."""
+    """The state vector at the end of a step, with values of functions there."""
 
     x: jax.Array
     compensation: jax.Array
@@ -285,7 +286,7 @@ class StepEnd(NamedTuple):
 
 
 def end_of_step(system: System, method: OneStepMethod, x, compensation, h, k) -> StepEnd:
-    """Return the end of a step of size h with the slopes k."""
+    """Return the state vector and the values of functions at the end of a step with slopes k."""
     new_x, new_compensation = method.move(system, x, compensation, h, k)
     energy, entropy = energy_and_entropy_at(system, new_x)
     finite_check = jnp.sum(new_x) + energy + entropy
@@ -316,7 +317,7 @@ would move the body by any amount."""
 
 
 def drift_correction_multiplier(system: System, function: Energy, x, compensation, value, level) -> jax.Array:
-    """Return the multiple of ∇F to subtract from x to bring the function F back towards its value ``level``.
+    """Return the multiple of ∇F to subtract from x so that the function F approaches its value ``level``.
 
     The shift is about ``eps |x| / 4`` at most, and zero unless value and level differ by more than a few roundings.
     """
@@ -341,7 +342,7 @@ since :func:`drift_correction_multiplier` removes it. With half of this spacing 
 
 
 def round_to_nearest_level(value, sensitivity) -> jax.Array:
-    """Return ``value`` rounded to a multiple of 16 to 32 rounding errors of a function with this sensitivity.
+    """Return ``value`` rounded to a level: a multiple of 16 to 32 rounding errors of a function.
 
     A run that knows only its present state is held on these levels: a value near a level stays there.
     """
@@ -350,7 +351,7 @@ def round_to_nearest_level(value, sensitivity) -> jax.Array:
 
 
 def compensation_from_state(system: System, method: OneStepMethod, x, clock_compensation) -> jax.Array:
-    """Return the compensation, shape (n,), of a step for which only x and its clock's part are known.
+    """Return the compensation of a step, shape (n,), from its state x and the compensation of its clock.
 
     It shifts the state by less than its rounding: onto its constraint surface, and to a level of each function that the
     method conserves. Without it the roundings of the states would add up, with a mean that is not zero.
@@ -365,9 +366,9 @@ def compensation_from_state(system: System, method: OneStepMethod, x, clock_comp
     return compensation
 
 
-def compensation_after_drift_correction(system: System, x, compensation, amount) -> jax.Array:
-    """Return the compensation of a state shifted by ``-amount`` along the gradient of the energy."""
-    return compensation - amount * system.raise_index(x, system.energy.gradient(x))
+def compensation_after_drift_correction(system: System, x, compensation, multiplier) -> jax.Array:
+    """Return the compensation of a state shifted by ``-multiplier`` along the gradient of the energy."""
+    return compensation - multiplier * system.raise_index(x, system.energy.gradient(x))
 
 
 def energy_and_entropy_at(system: System, x) -> tuple[jax.Array, jax.Array]:
@@ -377,11 +378,11 @@ def energy_and_entropy_at(system: System, x) -> tuple[jax.Array, jax.Array]:
 
 
 def rounding_sensitivities(system: System, x) -> tuple[jax.Array, jax.Array]:
-    """Return the scales at which energy and entropy are rounded at x: see :meth:`liethermo.Energy.sensitivity`."""
+    """Return the scales of the rounding errors of energy and entropy at x: see :meth:`liethermo.Energy.sensitivity`."""
     entropy = jnp.zeros(()) if system.entropy is None else system.entropy.sensitivity(x)
     return system.energy.sensitivity(x), entropy
 
 
 def energy_or_entropy_that_relaxes(system: System, energy, entropy):
-    """Return the one of two values that relaxes to equilibrium: the energy under a double bracket, else the entropy."""
+    """Return the value that relaxes to equilibrium: the energy under a double bracket, else the entropy."""
     return energy if system.energy_law == "nonincreasing" else entropy

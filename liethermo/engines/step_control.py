@@ -20,7 +20,7 @@ from manifolds._pytree_module import Module
 from ..dissipation.geometry import project_tangent
 from ..integrators import OneStepMethod
 from ..systems import System
-from ..systems.clock import clock_components
+from ..systems.clock import keep_clock_components
 from ..tracing.programs import jit_cached
 from . import root_bracket
 from .solver_options import EPS
@@ -37,13 +37,13 @@ POWER_ITERATIONS = 4
 """Number of power iterations that estimate the spectral radius of the Jacobian of a larger system."""
 
 
-def jacobian_probe(system: System, x) -> jax.Array:
-    """Return a probe of the Jacobian of the vector field at x, from which growth rates are estimated.
+def probe_jacobian(system: System, x) -> jax.Array:
+    """Return the Jacobian of the vector field at x, or power iterates of it if it is large, for growth rates.
 
     For at most :data:`DENSE_JACOBIAN_DIM` components the probe is the Jacobian matrix, shape (n, n). Otherwise it has
     shape (:data:`POWER_ITERATIONS`, n): the images of normalised iterates of the power method.
     """
-    jacobian_product, n = _jacobian_product(system, x), x.shape[0]
+    jacobian_product, n = _make_jacobian_product(system, x), x.shape[0]
     if n <= DENSE_JACOBIAN_DIM:
         return jax.vmap(jacobian_product)(jnp.eye(n)).T
 
@@ -56,12 +56,12 @@ def jacobian_probe(system: System, x) -> jax.Array:
 
 @jit_cached
 def arnoldi_hessenberg(system, method, x):
-    """Return the Hessenberg matrix of Arnoldi's method, shape (m, m), for the Jacobian of the vector field at x.
+    """Return the Hessenberg matrix, shape (m, m), of Arnoldi's method for the Jacobian of the field at x.
 
     Its eigenvalues approximate the extremal eigenvalues of the Jacobian.
     """
     system, x = system.solved_subsystem(x)
-    jacobian_product, n = _jacobian_product(system, x), x.shape[0]
+    jacobian_product, n = _make_jacobian_product(system, x), x.shape[0]
     m = min(n, KRYLOV_DIM)
 
     def arnoldi_step(carry, i):
@@ -87,8 +87,8 @@ def arnoldi_hessenberg(system, method, x):
     return matrix[:m]
 
 
-def _jacobian_product(system: System, x) -> Callable:
-    """Return the product of the Jacobian of the vector field at x with tangent vectors, as a function.
+def _make_jacobian_product(system: System, x) -> Callable:
+    """Return a function that multiplies tangent vectors by the Jacobian of the vector field at x.
 
     Rows and columns of the time and the work are zero: nothing grows by them, and in the unit of the clock derivatives
     by the time are so large that the eigenvalues of the whole matrix would be rounding errors.
@@ -96,13 +96,13 @@ def _jacobian_product(system: System, x) -> Callable:
 
     def restrict(v) -> jax.Array:
         v = project_tangent(system, x, v)
-        return v - clock_components(system, v)
+        return v - keep_clock_components(system, v)
 
     return lambda v: restrict(jax.jvp(system.vector_field, (x,), (restrict(v),))[1])
 
 
 def _fixed_random_vector(n: int) -> np.ndarray:
-    """Return a fixed random vector, which has a component along every eigenvector."""
+    """Return the same random vector at each call, shape (n,), with components along all eigenvectors."""
     return np.random.default_rng(0).standard_normal(n)
 
 
@@ -156,7 +156,7 @@ JACOBIAN_CHANGE_RTOL = 0.05
 
 
 class StepControl(Module):
-    """Parameters of the step-size controller and of the event search: arguments of a program, like those of a system.
+    """Parameters of adaptive steps and of the event search, passed to programs as arguments.
 
     Attributes
     ----------
@@ -181,23 +181,23 @@ class StepControl(Module):
     adaptive: bool = eqx.field(static=True)
 
     def allowed_error(self, scale) -> jax.Array:
-        """Return the error allowed for a state of norm ``scale``."""
+        """Return the error of a step that is allowed for a state of norm ``scale``."""
         return self.atol + self.rtol * scale
 
     @property
     def event_shape(self) -> tuple[int]:
-        """Shape of an array with one number for each event function; without functions it has one entry."""
+        """Shape of an array with one value for each event function; (1,) without functions."""
         return (max(1, len(self.event_functions)),)
 
     def event_values(self, system: System, t, x) -> jax.Array:
-        """Return the values of the event functions, shape ``event_shape``."""
+        """Return the values of the event functions at (t, x), shape ``event_shape``."""
         if not self.event_functions:
             return jnp.zeros(self.event_shape)
         return jnp.stack([function(system, t, x) for function in self.event_functions])
 
 
 class AdaptiveState(NamedTuple):
-    """State of an adaptive run; ``state.status`` also holds the reason of a pause."""
+    """The state of an adaptive run; its ``state.status`` may be the reason of a pause."""
 
     state: State
     t: jax.Array
@@ -218,15 +218,15 @@ class AdaptiveState(NamedTuple):
 
 
 def jacobian_probe_shape(system: System, method: OneStepMethod, control: StepControl) -> tuple[int, ...]:
-    """Return the shape of the field ``jacobian_probe`` of an adaptive state; (1, 1) if the steps are fixed."""
+    """Return the shape of the field ``jacobian_probe`` of an adaptive state; (1, 1) for fixed steps."""
     if not control.adaptive:
         return 1, 1
     x = jax.ShapeDtypeStruct((system.dim,), jnp.float64)
-    return jax.eval_shape(lambda x: jacobian_probe(*system.solved_subsystem(x)), x).shape
+    return jax.eval_shape(lambda x: probe_jacobian(*system.solved_subsystem(x)), x).shape
 
 
 def next_step_size_and_end_time(control: StepControl, adaptive_state: AdaptiveState) -> tuple[jax.Array, jax.Array]:
-    """Return the size of the next step, which may be a trial step of an event search, and the time after it."""
+    """Return the size of the next step or of the next trial step of an event search, and the time after it."""
     h, time_after = next_step_size_and_end_time_outside_event_search(control, adaptive_state)
     if not control.event_functions:
         return h, time_after
@@ -239,7 +239,7 @@ def next_step_size_and_end_time(control: StepControl, adaptive_state: AdaptiveSt
 def next_step_size_and_end_time_outside_event_search(
     control: StepControl, adaptive_state: AdaptiveState
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the size of the next step outside an event search, and the time at its end.
+    """Return the size of the next step, if no event is searched for, and the time after it.
 
     No step ends just before a stop time.
     """
@@ -277,11 +277,11 @@ def next_step_size_and_end_time_outside_event_search(
 def step_size_after_acceptance(
     optimal, previous_optimal, h, planned_size, power, max_step, explicit: bool
 ) -> jax.Array:
-    """Return the step size after an accepted step of size h; ``optimal`` would have had the allowed error.
+    """Return the size of the next step after an accepted one of size h.
 
-    If the optimal size shrinks, from ``previous_optimal``, the trend is extrapolated [Gustafsson; Hairer & Wanner 1996,
-    IV.8]. The step size of an implicit method is kept if the change would be small. A truncated step tells little about
-    the next one.
+    A step of the size ``optimal`` would have had the allowed error. If the optimal size shrinks, from
+    ``previous_optimal``, the trend is extrapolated [Gustafsson; Hairer & Wanner 1996, IV.8]. The step size of an
+    implicit method is kept if the change would be small. A truncated step tells little about the next one.
     """
     max_factor = MAX_FACTOR_EXPLICIT if explicit else MAX_FACTOR_IMPLICIT
     trend = jnp.where(
@@ -298,7 +298,7 @@ def step_size_after_acceptance(
 
 
 def step_size_after_rejection(error, h, power) -> jax.Array:
-    """Return the step size after a rejected step; an infinite error means unsolved stage equations."""
+    """Return the size of the next step after a rejected one of size h with a given error, infinite if unsolved."""
     is_solved = jnp.isfinite(error)
     factor = jnp.maximum(
         MIN_FACTOR, (ERROR_TARGET_FRACTION / jnp.where(is_solved, jnp.maximum(error, 1.0), 1.0)) ** power
@@ -310,7 +310,7 @@ def step_size_after_rejection(error, h, power) -> jax.Array:
 
 
 def max_step_times_rate(method: OneStepMethod, relative_error):
-    """Return the largest product of step size and rate at which a motion of that rate has this relative error.
+    """Return the largest product of step size and rate for which the relative error is as given.
 
     A step of a one-step method multiplies the solution of a linear equation of rate r by R(h r), instead of exp(h r).
     R is assumed to be the diagonal Padé approximation of the method's order.
@@ -321,7 +321,7 @@ def max_step_times_rate(method: OneStepMethod, relative_error):
 
 
 def max_step_times_growth_rate_for_accuracy(method: OneStepMethod) -> float:
-    """Return the largest product of step size and growth rate at which growth is accurate to :data:`GROWTH_RATE_RTOL`.
+    """Return the largest product of step and growth rate for which growth is accurate to :data:`GROWTH_RATE_RTOL`.
 
     Implicit methods damp or preserve what they do not resolve, so a long step can miss an instability.
     """
@@ -329,7 +329,7 @@ def max_step_times_growth_rate_for_accuracy(method: OneStepMethod) -> float:
 
 
 def max_step_for_attitude(method: OneStepMethod, system: System, x, relative_error) -> jax.Array:
-    """Return the largest step in which an attitude that turns steadily, at its rate at x, has this relative error.
+    """Return the largest step in which an attitude that turns at its rate at x has a given relative error.
 
     Explicit methods follow rotation angles, which are exact in a steady turn: they only need the angles to be small.
     """
@@ -340,9 +340,9 @@ def max_step_for_attitude(method: OneStepMethod, system: System, x, relative_err
 
 
 def limit_next_step_by_growth_rate(method: OneStepMethod, adaptive_state: AdaptiveState, probe) -> AdaptiveState:
-    """Return the adaptive state with its next step limited by the growth rate; pause if that rate is unknown.
+    """Return the adaptive state with its next step limited by the growth rate, or paused to compute this rate.
 
-    ``probe`` is the Jacobian probe at the state: see :func:`.step_control.jacobian_probe`.
+    ``probe`` is the Jacobian probe at the state: see :func:`.step_control.probe_jacobian`.
     """
     is_short = ~(
         (max_step_times_growth_rate_for_accuracy(method) < spectral_radius_bound(probe) * adaptive_state.next_step_size)
@@ -374,7 +374,7 @@ def limit_next_step_by_growth_rate(method: OneStepMethod, adaptive_state: Adapti
 
 
 def spectral_radius_bound(probe) -> jax.Array:
-    """Return an upper bound (from the matrix) or an estimate (from power iterates) of the spectral radius."""
+    """Return a bound or an estimate of the spectral radius of the Jacobian, from its matrix or power iterates."""
     if probe.shape[1] > DENSE_JACOBIAN_DIM:
         return jnp.sqrt(jnp.max(jnp.sum(probe * probe, axis=1)))
     matrix_squared = probe @ probe
@@ -386,12 +386,12 @@ def frobenius_norm(matrix) -> jax.Array:
 
 
 def max_growth_rates(matrices: np.ndarray) -> np.ndarray:
-    """Return the largest modulus of the growing eigenvalues of each matrix, for matrices of shape (..., n, n)."""
+    """Return the largest modulus of growing eigenvalues of each matrix, shape (...), of matrices (..., n, n)."""
     is_finite = np.isfinite(matrices).all(axis=(-2, -1))
     rates = np.linalg.eigvals(np.where(is_finite[..., None, None], matrices, 0.0))
     return np.where(rates.real > MIN_GROWTH_TO_FREQUENCY * np.abs(rates), np.abs(rates), 0.0).max(axis=-1, initial=0.0)
 
 
 def largest_growth_rate_by_arnoldi(system: System, method: OneStepMethod, x) -> float:
-    """Return the largest growth rate at x by Arnoldi's method, for more than DENSE_JACOBIAN_DIM components."""
+    """Return the largest growth rate of the linear motion at x, by Arnoldi's method, for large systems."""
     return float(max_growth_rates(np.asarray(arnoldi_hessenberg(system, method, jnp.asarray(x)))))

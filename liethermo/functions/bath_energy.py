@@ -14,11 +14,17 @@ import scipy
 from manifolds._arrays import is_traced
 
 from ..errors import InputError
+from .conditions import Condition
 from .energy import Energy, Linear, Pullback, SpanLimitedEnergy, StateTimeEnergy
 from .frames import sum_terms
 from .indices import Components, pattern_of_matrix, sparsity_pattern
 from .path import CollocationPath
 from .time_span import TimeSpan
+
+BATH_CAPACITY_CONDITION = Condition(lambda a: a > 0.0, "the capacity of a bath must be positive, got {value}")
+BATH_TEMPERATURE_CONDITION = Condition(
+    lambda a: (a > 0.0) & (a < np.inf), "the temperature of a bath must be positive and finite, got {value}"
+)
 
 MAX_SERIES_ARGUMENT = 1 / 32
 """Largest argument of the series of ``(exp(z) - 1) / z``: its truncation after eight terms is then below rounding."""
@@ -38,8 +44,8 @@ class BathEnergy(Energy):
         C and T.
     """
 
-    capacity: jax.Array
-    temperature: jax.Array
+    capacity: jax.Array = eqx.field(metadata=BATH_CAPACITY_CONDITION.metadata)
+    temperature: jax.Array = eqx.field(metadata=BATH_TEMPERATURE_CONDITION.metadata)
 
     def value(self, x) -> jax.Array:
         return jnp.sum(self.temperature * _exp_and_expm1_quotient(x * self.rate)[1] * x)
@@ -75,6 +81,8 @@ class BathEnergy(Energy):
 
 class ReservoirEnergy(Linear):
     """The energy ``sum_b T_b y_b`` of baths of infinite capacity, with entropies y and constant temperatures."""
+
+    b: jax.Array = eqx.field(metadata=BATH_TEMPERATURE_CONDITION.metadata)
 
     @property
     def temperature(self) -> jax.Array:

@@ -16,6 +16,95 @@ from manifolds._arrays import is_traced, real_array
 from ..errors import InputError
 
 
+class Condition(NamedTuple):
+    """A condition on a parameter, for the constructor of its object and for values that are given by name later.
+
+    Attributes
+    ----------
+    test : function from an array to an array of truth values
+        Of each entry, or of each row.
+    template : str
+        The message of the error, with a placeholder: ``"a rate must be >= 0, got {value}"``.
+    matrix_test : function from matrices, shape (..., n, n), to truth values, shape (...); optional
+        The test of a value that is a matrix, for parameters that are a matrix or its diagonal.
+    matrix_template : str
+    """
+
+    test: Callable
+    template: str
+    matrix_test: Callable | None = None
+    matrix_template: str = ""
+
+    @property
+    def metadata(self) -> dict[str, Condition]:
+        """Metadata of a field of a module, ``eqx.field(metadata=condition.metadata)``, whose values given by name have
+        to meet the condition."""
+        return {"condition": self}
+
+    def require(self, value) -> None:
+        """Raise InputError unless the condition holds for a value; record it for a traced value."""
+        require_condition(value, *self._test_and_template(np.ndim(value)))
+
+    def holds(self, value: np.ndarray) -> bool:
+        """Return whether the condition holds for a value."""
+        return bool(self._test_and_template(value.ndim)[0](value).all())
+
+    def violations(self, values: np.ndarray) -> dict[int, str]:
+        """Return the values along the first axis for which the condition does not hold, with the messages; NaN is left
+        out."""
+        test, template = self._test_and_template(values.ndim - 1)
+        has_nan = np.isnan(values).reshape(len(values), -1).any(axis=1)
+        holds = np.asarray(test(np.where(np.isnan(values), 1.0, values))).reshape(len(values), -1).all(axis=1)
+        return {int(i): condition_message(template, values[i]) for i in np.flatnonzero(~holds & ~has_nan)}
+
+    def _test_and_template(self, ndim: int) -> tuple[Callable, str]:
+        if ndim == 2 and self.matrix_test is not None:
+            return self.matrix_test, self.matrix_template
+        return self.test, self.template
+
+
+def positive_condition(name: str) -> Condition:
+    """Return the condition that numbers are positive and finite."""
+    return Condition(lambda a: (a > 0.0) & (a < np.inf), name + " must be positive and finite, got {value}")
+
+
+def nonnegative_condition(name: str) -> Condition:
+    """Return the condition that numbers are zero or positive, and finite."""
+    return Condition(lambda a: (a >= 0.0) & (a < np.inf), name + " must be >= 0 and finite, got {value}")
+
+
+def semidefinite_condition(name: str, symmetric: bool = True) -> Condition:
+    """Return the condition that the entries of a diagonal are >= 0, or that a matrix is positive semidefinite.
+
+    Without ``symmetric`` only its symmetric part has to be semidefinite.
+    """
+    matrix_text = "symmetric and positive semidefinite" if symmetric else "positive semidefinite"
+    return Condition(
+        lambda a: (a >= 0.0) & (a < np.inf),
+        name + " must be >= 0 and finite, got {value}",
+        _are_symmetric_and_semidefinite if symmetric else _are_semidefinite,
+        f"{name} must be {matrix_text}, got {{value}}",
+    )
+
+
+def _are_symmetric_and_semidefinite(matrices):
+    xp = np if isinstance(matrices, np.ndarray) else jnp
+    asymmetry = xp.abs(matrices - xp.swapaxes(matrices, -1, -2)).max(axis=(-2, -1))
+    return _are_semidefinite(matrices) & (asymmetry <= 1e-12 * xp.abs(matrices).max(axis=(-2, -1)))
+
+
+def _are_semidefinite(matrices):
+    xp = np if isinstance(matrices, np.ndarray) else jnp
+    eigenvalues = xp.linalg.eigvalsh(0.5 * (matrices + xp.swapaxes(matrices, -1, -2)))
+    return eigenvalues[..., 0] >= -1e-12 * matrices.shape[-1] * xp.abs(matrices).max(axis=(-2, -1))
+
+
+def condition_of_field(owner: Any, name: str) -> Condition | None:
+    """Return the condition of a field of a module; None if it has none."""
+    field = getattr(type(owner), "__dataclass_fields__", {}).get(name)
+    return None if field is None else field.metadata.get("condition")
+
+
 class TracedCondition(NamedTuple):
     """A condition on a value that is being traced, recorded for a check with numbers.
 

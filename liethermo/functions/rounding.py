@@ -60,7 +60,8 @@ def value_and_rounding_scale(function: Callable, x) -> tuple[jax.Array, jax.Arra
     closed_jaxpr = jax.make_jaxpr(function)(x)
 
     def evaluate_perturbed(amplitudes):
-        return _evaluate_perturbed(closed_jaxpr.jaxpr, closed_jaxpr.consts, [x], itertools.count(), amplitudes)[0]
+        perturbation = Perturbation(amplitudes, itertools.count())
+        return _evaluate_perturbed(closed_jaxpr.jaxpr, closed_jaxpr.consts, [x], perturbation)[0]
 
     # vectorised samples compile faster; large arrays are mapped one by one to save memory, and so are functions that
     # contain routines, such as networks, which all samples then share
@@ -86,9 +87,9 @@ def propagated_rounding_scale(function: Callable, x, input_scales) -> jax.Array:
     closed_jaxpr = jax.make_jaxpr(function)(x)
 
     def evaluate_perturbed(amplitudes):
-        numbers = itertools.count()
-        perturbed_x = x + (_perturb(input_scales, next(numbers), amplitudes) - input_scales)
-        return _evaluate_perturbed(closed_jaxpr.jaxpr, closed_jaxpr.consts, [perturbed_x], numbers, amplitudes)[0]
+        perturbation = Perturbation(amplitudes, itertools.count())
+        perturbed_x = x + input_scales * perturbation.next_errors(input_scales.shape)
+        return _evaluate_perturbed(closed_jaxpr.jaxpr, closed_jaxpr.consts, [perturbed_x], perturbation)[0]
 
     zero_amplitudes = jnp.zeros(PERTURBATION_SAMPLES)
     derivatives = [
@@ -97,8 +98,41 @@ def propagated_rounding_scale(function: Callable, x, input_scales) -> jax.Array:
     return jnp.max(jnp.abs(jnp.stack(derivatives)))
 
 
-def _evaluate_perturbed(jaxpr: Jaxpr, constants, arguments, pattern_numbers: Iterator[int], amplitudes) -> list:
-    """Return the results of a jaxpr in which the result of each equation is perturbed, by relative amplitudes."""
+class Perturbation:
+    """Small random relative errors, one array for each result of a program.
+
+    Arrays of one shape repeat after :data:`PATTERNS_PER_SHAPE` results, and a program computes each of them once.
+
+    Parameters
+    ----------
+    amplitudes : array, shape (PERTURBATION_SAMPLES,)
+        Each of them is the amplitude of a pattern of its own; the errors are their sum.
+    result_numbers : iterator
+        It numbers the results, also across the routines of a program.
+    """
+
+    def __init__(self, amplitudes, result_numbers: Iterator[int]):
+        self.amplitudes, self.result_numbers = amplitudes, result_numbers
+        self._errors: dict[tuple, jax.Array] = {}
+
+    def next_errors(self, shape: tuple[int, ...]) -> jax.Array:
+        """Return the errors of the next result, shape ``shape[-1:]``: its rows have the same errors."""
+        key = shape[-1:], next(self.result_numbers) % PATTERNS_PER_SHAPE
+        if key not in self._errors:
+            self._errors[key] = self._sum_of_patterns(*key)
+        return self._errors[key]
+
+    def _sum_of_patterns(self, shape: tuple[int, ...], pattern_number: int) -> jax.Array:
+        pattern = _stored_random_numbers if math.prod(shape) <= MAX_STORED_PATTERN_LENGTH else _pseudorandom_numbers
+        errors = [
+            amplitude * pattern(shape, (pattern_number + PERTURBATION_SAMPLES * i) % PATTERNS_PER_SHAPE)
+            for i, amplitude in enumerate(self.amplitudes)
+        ]
+        return sum(errors[1:], errors[0])
+
+
+def _evaluate_perturbed(jaxpr: Jaxpr, constants, arguments, perturbation: Perturbation) -> list:
+    """Return the results of a jaxpr in which the result of each equation has a relative error."""
     values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments], strict=True))
     for equation in jaxpr.eqns:
         inputs = [v.val if isinstance(v, Literal) else values[v] for v in equation.invars]
@@ -106,14 +140,15 @@ def _evaluate_perturbed(jaxpr: Jaxpr, constants, arguments, pattern_numbers: Ite
         inner = next((parameters[key] for key in JAXPR_PARAMETERS if key in parameters), None)
         if isinstance(inner, ClosedJaxpr) and name not in CONTROL_PRIMITIVES and not _is_iteration(equation):
             if _is_routine_call(equation):
+                # Errors of its own: arrays of this program are not known inside the routine.
                 routine = jax.jit(
                     lambda inputs, amplitudes, i=inner: _evaluate_perturbed(
-                        i.jaxpr, i.consts, inputs, pattern_numbers, amplitudes
+                        i.jaxpr, i.consts, inputs, Perturbation(amplitudes, perturbation.result_numbers)
                     )
                 )
-                results = routine(inputs, amplitudes)
+                results = routine(inputs, perturbation.amplitudes)
             else:
-                results = _evaluate_perturbed(inner.jaxpr, inner.consts, inputs, pattern_numbers, amplitudes)
+                results = _evaluate_perturbed(inner.jaxpr, inner.consts, inputs, perturbation)
         else:
             bind_params = equation.primitive.get_bind_params(parameters)
             # older versions of JAX return (functions, parameters)
@@ -121,7 +156,7 @@ def _evaluate_perturbed(jaxpr: Jaxpr, constants, arguments, pattern_numbers: Ite
             results = equation.primitive.bind(*functions, *inputs, **parameters)
             results = results if equation.primitive.multiple_results else [results]
             if name not in EXACT_PRIMITIVES:
-                results = [_perturb(value, next(pattern_numbers), amplitudes) for value in results]
+                results = [_perturb(value, perturbation) for value in results]
         values.update(zip(equation.outvars, results, strict=True))
     return [v.val if isinstance(v, Literal) else values[v] for v in jaxpr.outvars]
 
@@ -141,17 +176,12 @@ def _is_iteration(equation) -> bool:
     return any(inner.primitive.name in ("scan", "while") for inner in equation.params["call_jaxpr"].jaxpr.eqns)
 
 
-def _perturb(value, pattern_number: int, amplitudes):
-    """Return a value with small random errors added, relative to its entries: a stored pattern times each amplitude."""
+def _perturb(value, perturbation: Perturbation):
+    """Return a value with the next relative errors added to its entries; numbers that are not floats as they are."""
     if not jnp.issubdtype(jnp.result_type(value), jnp.inexact):
         return value
-    shape = np.shape(value)[-1:]
-    pattern = _stored_random_numbers if math.prod(shape) <= MAX_STORED_PATTERN_LENGTH else _pseudorandom_numbers
-    errors = [
-        amplitude * pattern(shape, (pattern_number + PERTURBATION_SAMPLES * i) % PATTERNS_PER_SHAPE)
-        for i, amplitude in enumerate(amplitudes)
-    ]
-    return value + (value * sum(errors[1:], errors[0])).astype(jnp.result_type(value))  # single precision is preserved
+    # single precision is preserved
+    return value + (value * perturbation.next_errors(np.shape(value))).astype(jnp.result_type(value))
 
 
 @functools.cache

@@ -149,7 +149,9 @@ class OneStepMethod(Module):
     def initial_compensation(self, system: System, x) -> jax.Array:
         """Return the compensation at the start of a run, shape (n,): the displacement from x to its surface."""
         nothing = jnp.zeros_like(x)
-        return nothing if system.surface is None else system.surface.correct_rounding(x, nothing)[1]
+        return (
+            nothing if system.constraint_surface is None else system.constraint_surface.correct_rounding(x, nothing)[1]
+        )
 
     def start(self, system: System, x) -> jax.Array:
         """Return the slopes, shape (stages, n), with which the iteration of the first step begins."""
@@ -256,7 +258,8 @@ class TransportingMethod(OneStepMethod):
         """
 
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
-        """Return the velocities at the stages, shape (stages, n): :meth:`.System.transport` of the step's gradients.
+        """Return the velocities at the stages, shape (stages, n): :meth:`.System.transport_covector` at
+        the gradients of the step.
 
         An explicit method has none: an attitude follows its steps by angles of their own.
         """
@@ -306,7 +309,7 @@ def apply_increment(
     The step of an implicit method also keeps the ``invariants``, functions besides energy and entropy.
     ``ends_on_surface`` says that d needs no projection, ``is_noisy`` that noise contributes to d.
     """
-    surface = system.surface
+    surface = system.constraint_surface
     if surface is None:
         return two_sum(x, compensation + d)
     if not (method.explicit or ends_on_surface or surface.is_kept_by_collocation):

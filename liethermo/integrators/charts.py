@@ -68,7 +68,7 @@ class InCharts(MethodWrapper):
         The second derivatives of a chart may not exist. Where they do, compiling them would take most of the time, and
         they are hardly ever needed.
         """
-        scales, residual = system.component_scales(k), self.slopes(system, x, compensation, h, k) - k
+        scales, residual = system.slope_scales(k), self.slopes(system, x, compensation, h, k) - k
 
         def difference_quotient(direction):
             step_size = EPS**0.5 / jnp.max(jnp.abs(direction) / scales)

@@ -17,7 +17,7 @@ from ..dissipation.base import terms_with_preserved_values
 from ..errors import InputError
 from ..functions.energy import Energy
 from ..functions.gradients import EPS
-from ..systems import System, TurningSystem
+from ..systems import AttitudeChartSystem, System
 from ..systems.transport import generator_field, has_generator
 from .base import OneStepMethod, TransportingMethod
 from .charts import InCharts, wrap_in_charts
@@ -243,7 +243,7 @@ class ExplicitMethod(TransportingMethod):
         )
         if follow_leaf:
             d, error, interpolation_rows = d[n:], error[:n], interpolation_rows[:, :n]
-        if system.hints.has_fixed_levels:
+        if system.engine_hints.has_fixed_levels:
             changes = changes + self._drift_correction_changes(
                 system, laws, start_gradients, x, compensation, k[StepRow.INITIAL_LEVELS], follow_leaf
             )
@@ -340,14 +340,14 @@ class ExplicitMethod(TransportingMethod):
 
         If the field has a form without the entropy, the rates are not needed and zero.
         """
-        system = system.freeze_at(x)
+        system = system.cache_tensors_at(x)
         if has_generator(system):
             return generator_field(system, x), jnp.zeros(len(laws))
         dH = system.energy.gradient(x)
         if not system.total_dissipation.terms:
             return system.field(x, dH, jnp.zeros_like(x)), jnp.zeros(len(laws))
         dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
-        dL = tuple(L.gradient(x) for L in system.preserved)
+        dL = tuple(L.gradient(x) for L in system.preserved_functions)
         terms = list(terms_with_preserved_values(system.total_dissipation.terms, dL))
 
         def law_rate_from_dissipation(law: Law) -> jax.Array:
@@ -392,7 +392,7 @@ class ExplicitMethod(TransportingMethod):
         """
         functions = system.functions()
         laws = [Law(system.energy, LAW_SIGNS[system.energy_law])] if system.energy_law in LAW_SIGNS else []
-        constant_names = set() if system.surface is None else {system.surface.name}
+        constant_names = set() if system.constraint_surface is None else {system.constraint_surface.name}
         constant_names |= set(system.casimirs()) if follow_leaf else set()
         laws += [Law(functions[name], 0.0) for name in self.held if name not in constant_names]
         laws += [Law(C, 0.0) for C in self.functions]
@@ -427,4 +427,4 @@ def constraint_residual(k) -> jax.Array:
 
 def _max_stored_levels(system: System) -> int:
     """Return how many initial levels a run can store, one in each component of the state that is not an angle."""
-    return system.inner.dim if isinstance(system, TurningSystem) else system.dim
+    return system.inner_system.dim if isinstance(system, AttitudeChartSystem) else system.dim

@@ -99,7 +99,7 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
         ]
         if turns:
             others = sum((B.times(w) for B, w in factors_and_inputs if B.spin_coefficients is None), jnp.zeros_like(z))
-            slopes = system.solve_at_spins(z, dH, dS, sum(turns[1:], turns[0]), others, 0.5 * h, k[0])
+            slopes = system.solve_slopes_at_each_spin(z, dH, dS, sum(turns[1:], turns[0]), others, 0.5 * h, k[0])
             if slopes is not None:
                 return slopes[None]
         return sum((B.times(w) for B, w in factors_and_inputs), system.field(z, dH, dS, dL))[None]
@@ -107,9 +107,9 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
         z, dH, dS, dL = self.method.midpoint_and_gradients(system, x, compensation, h, k)
         factors_and_inputs = self._factors_and_drift_plus_noise(system, z, dH, dL, h)
-        return sum((B.velocity(w) for B, w in factors_and_inputs if B.velocity), start=system.transport(z, dH, dS, dL))[
-            None
-        ]
+        return sum(
+            (B.velocity(w) for B, w in factors_and_inputs if B.velocity), start=system.transport_covector(z, dH, dS, dL)
+        )[None]
 
     def can_transport_attitude(self, system: System) -> bool:
         point = jnp.asarray(system.samples(1)[0])

@@ -22,7 +22,7 @@ from ..functions.energy import Energy
 from ..functions.frames import OrthonormalFrame, gram_schmidt
 from ..functions.gradients import CorrectionDirection, FunctionChange, correct_gradients, discrete_gradients_at_stages
 from ..systems import System
-from ..systems.invariants import preserved_by_name, preserved_names, stack_gradients
+from ..systems.invariants import number_preserved_functions, preserved_function_names, stack_gradients
 from ..systems.transport import has_generator
 from ..tracing.interpret import evaluate_at_points
 from .base import (
@@ -232,10 +232,10 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         return None if points is None else jax.vmap(system.poisson.sharp)(points, dH)
 
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
-        names = tuple(preserved_by_name(system))
+        names = tuple(number_preserved_functions(system))
 
         def velocity(u, dH, dS, gradients_by_name):
-            return system.transport(u, dH, dS, tuple(gradients_by_name[name].discrete for name in names))
+            return system.transport_covector(u, dH, dS, tuple(gradients_by_name[name].discrete for name in names))
 
         return jax.vmap(velocity)(*self._stages_and_gradients(system, x, compensation, h, k))
 
@@ -256,7 +256,9 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         dH = self._energy_gradients(system, u, x, compensation, h, k)
         gradients_by_name = {
             name: discrete_and_continuous_gradients(C)
-            for name, C in (self._held_functions(system) | entropy_functions | preserved_by_name(system)).items()
+            for name, C in (
+                self._held_functions(system) | entropy_functions | number_preserved_functions(system)
+            ).items()
         }
         if S is None:
             dS = jnp.zeros_like(k)
@@ -280,9 +282,9 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
 
     def _stage_slope(self, system: System, u, dH, dS, gradients_by_name: dict[str, StageGradients]) -> jax.Array:
         """Return the slope of one stage, ``Pi_d dH + K_d dS`` with discrete Poisson and friction matrices."""
-        system = system.freeze_at(u)
+        system = system.cache_tensors_at(u)
         slope = self._conservative_slope(system, u, dH, gradients_by_name)
-        keys_and_names = tuple(zip(preserved_by_name(system), preserved_names(system), strict=True))
+        keys_and_names = tuple(zip(number_preserved_functions(system), preserved_function_names(system), strict=True))
         for term, preserved_keys in terms_with_preserved_values(system.total_dissipation.terms, keys_and_names):
             slope = slope + self._dissipative_slope(term, preserved_keys, system, u, dH, dS, gradients_by_name)
         return slope
@@ -357,7 +359,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
 
     def can_transport_attitude(self, system: System) -> bool:
         """Return whether the steps determine the attitude exactly: they do if nothing is projected off the slopes."""
-        names = preserved_names(system)
+        names = preserved_function_names(system)
         terms = terms_with_preserved_values(system.total_dissipation.terms, names)
         has_only_quadratics = all(
             C.is_quadratic for C in (self._held_functions(system) | _functions_determining_entropy(system)).values()
@@ -367,7 +369,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         )
 
     def preserves_function(self, system: System, name: str) -> bool:
-        is_known_invariant = name in system.casimirs() or name in preserved_names(system)
+        is_known_invariant = name in system.casimirs() or name in preserved_function_names(system)
         return (
             self._is_held_by_default(system, name) if is_known_invariant else super().preserves_function(system, name)
         )
@@ -377,7 +379,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
 
         A skew friction is not projected, and keeps only quadratic functions by itself.
         """
-        if name not in system.casimirs() and name not in preserved_names(system):
+        if name not in system.casimirs() and name not in preserved_function_names(system):
             return False
         return system.total_dissipation.is_symmetric or system.functions()[name].is_quadratic
 

@@ -21,7 +21,7 @@ from ..functions.energy import Energy, make_energy
 from ..functions.surface import ConstraintSurface
 from ..functions.time_span import required_argument_count
 from ..systems import EvolutionSystem, System
-from ..systems.kind_checks import require_kind, user_system
+from ..systems.kind_checks import require_kind, unwrap_user_system
 from .base import WHY_FIXED_VARIATIONAL_STEP, OneStepMethod, apply_increment, checked_step_size
 
 _SUZUKI_OUTER_FRACTION = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
@@ -232,7 +232,7 @@ def _newton_velocity(residual: Callable, contact: mf.SplitContact, q, h, velocit
 
 def _evolution_system(system: System) -> EvolutionSystem:
     """Return the evolution system itself, or the one on a manifold that an embedded system wraps."""
-    return require_kind(user_system(system), EvolutionSystem, "DiscreteHerglotz")
+    return require_kind(unwrap_user_system(system), EvolutionSystem, "DiscreteHerglotz")
 
 
 class _ActionOfFlatArrays(Module):

@@ -17,7 +17,7 @@ from manifolds.matrices.linear import adjoint
 from ..dissipation.lindblad import LindbladJumps
 from ..errors import InputError
 from ..systems import QuantumSystem, System
-from ..systems.kind_checks import require_kind, user_system
+from ..systems.kind_checks import require_kind, unwrap_user_system
 from .base import OneStepMethod, register
 from .explicit import StepRow
 from .runge_kutta import END_SLOPE_ROW, hermite_cubic_weights
@@ -252,7 +252,7 @@ def _magnus_exponents(J0, J, J1, h, intervals) -> list[jax.Array]:
 
 def _undriven_quantum_system(system: System) -> QuantumSystem:
     """Return the quantum system itself, or the one that a driven system wraps."""
-    return require_kind(user_system(system), QuantumSystem, "KrausMethod")
+    return require_kind(unwrap_user_system(system), QuantumSystem, "KrausMethod")
 
 
 def _clock_and_work_increments(system: System, unit: float, x, h, middle, end) -> jax.Array:

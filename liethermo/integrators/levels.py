@@ -124,7 +124,7 @@ def project_onto_levels(
     then wander, and miss all levels by rounding of one sign. So the amount by which a function rises or falls is left
     open there: it changes as the others determine, or not at all if that change has the wrong sign.
     """
-    discrete_gradient, surface, clock = CHANGE_GRADIENT, system.surface, system.clock
+    discrete_gradient, surface, clock = CHANGE_GRADIENT, system.constraint_surface, system.clock
     work_direction = None if clock is None else clock.work_direction(system.dim)
     signs = jnp.asarray([law.sign for law in laws])
     functions, blocks = [law.function for law in laws], system.state_blocks
@@ -351,7 +351,7 @@ def correction_directions(
         gradients = [weights * gradient for gradient in gradients]
     if follow_leaf:
         gradients = [_symplectic_leaf_direction(system, x, gradient) for gradient in gradients]
-    directions, surface = [system.raise_index(x, gradient) for gradient in gradients], system.surface
+    directions, surface = [system.raise_index(x, gradient) for gradient in gradients], system.constraint_surface
     return directions if surface is None else [surface.project_direction(x, v) for v in directions]
 
 

@@ -79,11 +79,11 @@ class MetriplecticMidpoint(TransportingMethod):
         z = x + (compensation + 0.5 * d)
         dH = self.gradient(system.energy, x, d, compensation)
         dS = system.entropy_gradient(z)
-        dL = tuple(self.gradient(L, x, d, compensation) for L in system.preserved)
+        dL = tuple(self.gradient(L, x, d, compensation) for L in system.preserved_functions)
         return z, dH, dS, dL
 
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
-        return system.transport(*self.midpoint_and_gradients(system, x, compensation, h, k))[None]
+        return system.transport_covector(*self.midpoint_and_gradients(system, x, compensation, h, k))[None]
 
     def can_transport_attitude(self, system: System) -> bool:
         return True

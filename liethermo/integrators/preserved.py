@@ -12,7 +12,7 @@ from ..errors import InputError
 from ..functions.checks import checked_energy, with_polynomial_degrees
 from ..functions.energy import Energy, function_name, make_energy
 from ..systems import System
-from ..systems.invariants import conserves
+from ..systems.invariants import are_conserved
 
 
 def preserved_functions(preserve) -> tuple[Energy, ...]:
@@ -23,7 +23,7 @@ def preserved_functions(preserve) -> tuple[Energy, ...]:
 
 def function_on_states(system: System, C: Energy) -> Energy:
     """Return a preserved function as a function of the state vectors of a system."""
-    C = checked_energy(system.energy_of_vectors(C), system.dim, "a preserved function")
+    C = checked_energy(system.energy_of_flat_states(C), system.dim, "a preserved function")
     return with_polynomial_degrees(C, system.dim) if system.space is None else C
 
 
@@ -32,7 +32,7 @@ def check_preserved(system: System, functions: Sequence[Energy]) -> None:
 
     A function that cannot be tested, for example outside the domain of an entropy, counts as conserved.
     """
-    for C, is_conserved in zip(functions, conserves(system, tuple(functions)), strict=True):
+    for C, is_conserved in zip(functions, are_conserved(system, tuple(functions)), strict=True):
         if is_conserved is False:
             raise InputError(nonconservation_message(C))
 
@@ -53,7 +53,7 @@ CASIMIR_RTOL = 1e-10
 def casimir_residuals(system_and_functions: tuple[System, tuple[Energy, ...]], x) -> jax.Array:
     """Return ``|Pi grad C|`` of each function at x, relative to ``|Pi v|`` of another covector v of that length."""
     system, functions = system_and_functions
-    system = system.freeze_at(x)
+    system = system.cache_tensors_at(x)
     residuals = []
     for C in functions:
         gradient, random = C.gradient(x), jnp.cos(jnp.arange(1.0, x.shape[0] + 1.0))

@@ -15,8 +15,8 @@ from manifolds.matrices.linear import solve_near_identity
 from ..errors import InputError
 from ..functions.frames import vector_with_inner_products
 from ..functions.gradients import two_sum
-from ..systems import MOMENTUM_LESS_IMPULSE, SPATIAL_MOMENTUM, AttitudeSystem, TurningSystem
-from ..systems.transport import is_torque_free
+from ..systems import MOMENTUM_LESS_IMPULSE, SPATIAL_MOMENTUM, AttitudeChartSystem, AttitudeSystem
+from ..systems.transport import moves_by_transport_alone
 from .base import MethodWrapper, TransportingMethod, pullback_method
 from .explicit import StepRow
 from .tableaus import gauss_tableau
@@ -96,11 +96,11 @@ class WithAttitude(MethodWrapper):
 
     def slopes(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:  # type: ignore[override]
         """Return the slopes of the momentum; for an explicit method also those of the rotation angles."""
-        method, mu, mu_compensation = self.method, system.points(x), system.points(compensation)
+        method, mu, mu_compensation = self.method, system.body_states(x), system.body_states(compensation)
         if self.explicit:
-            local = TurningSystem(system, self.order, system.attitude_layout.split(x)[1])
+            local = AttitudeChartSystem(system, self.order, system.attitude_layout.split_state(x)[1])
             return pullback_method(method, local).slopes(
-                local, local.local_coordinates(x), local.local_coordinates(compensation), h, k
+                local, local.coordinates_of_state(x), local.coordinates_of_state(compensation), h, k
             )
         body = system.body
         if not body.torque_laws.needs_attitude:
@@ -115,17 +115,23 @@ class WithAttitude(MethodWrapper):
 
     def start(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
         if not self.explicit:
-            return self.method.start(system.body_at_attitude(x), system.points(x))
-        mu, g = system.attitude_layout.split(x)
-        local, n = TurningSystem(system, self.order, g), system.group.dim
+            return self.method.start(system.body_at_attitude(x), system.body_states(x))
+        mu, g = system.attitude_layout.split_state(x)
+        local, n = AttitudeChartSystem(system, self.order, g), system.group.dim
         k = self.method.start(
-            local, local.local_coordinates(x)
+            local, local.coordinates_of_state(x)
         )  # behind the levels that it has begun on is room for more
-        return k.at[StepRow.INITIAL_LEVELS, mu.shape[0] : mu.shape[0] + n].set(mu[:n] @ system.spatial_action(g))
+        return k.at[StepRow.INITIAL_LEVELS, mu.shape[0] : mu.shape[0] + n].set(
+            mu[:n] @ system.momentum_to_space_matrix(g)
+        )
 
     def error(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:  # type: ignore[override]
         return self.method.error(
-            system.body_at_attitude(x), system.points(x), system.points(compensation), h, system.points(k)
+            system.body_at_attitude(x),
+            system.body_states(x),
+            system.body_states(compensation),
+            h,
+            system.body_states(k),
         )
 
     def attitude_rate(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
@@ -135,20 +141,20 @@ class WithAttitude(MethodWrapper):
 
     def initial_compensation(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
         layout = system.attitude_layout
-        mu, g = layout.split(x)
+        mu, g = layout.split_state(x)
         attitude_correction = _correction_onto_group(system.group, g) if self.kind == "cayley" else jnp.zeros_like(g)
         momentum = jnp.zeros_like(layout.impulse(x)) if system.torque_laws.name else None
-        return layout.join(self.method.initial_compensation(system.body, mu), attitude_correction, momentum)
+        return layout.join_state(self.method.initial_compensation(system.body, mu), attitude_correction, momentum)
 
     # -- the attitude, which follows from it --------------------------------------------------------------------------
 
     def move(self, system: AttitudeSystem, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:  # type: ignore[override]
         layout = system.attitude_layout
         (mu, g), (mu_compensation, g_compensation) = (
-            layout.split(x),
-            layout.split(compensation),
+            layout.split_state(x),
+            layout.split_state(compensation),
         )
-        new_mu, new_mu_compensation = self.method.move(system.body, mu, mu_compensation, h, system.points(k))
+        new_mu, new_mu_compensation = self.method.move(system.body, mu, mu_compensation, h, system.body_states(k))
         if self.explicit:
             return self._apply_explicit_step(system, x, compensation, new_mu, new_mu_compensation, h, k)
         xi = (
@@ -161,21 +167,23 @@ class WithAttitude(MethodWrapper):
         if self.kind == "cayley":
             dg = (g + g_compensation) @ _collocation_increment(system.group.algebra.hat(xi))
             new_g, new_g_compensation = two_sum(g, g_compensation + dg)
-            return layout.join(new_mu, new_g, p), layout.join(
+            return layout.join_state(new_mu, new_g, p), layout.join_state(
                 new_mu_compensation, new_g_compensation + _correction_onto_group(system.group, new_g), p_compensation
             )
         new_g = system.group.restore_map(g @ self._attitude_increment(system.group, xi))
-        return layout.join(new_mu, new_g, p), layout.join(new_mu_compensation, jnp.zeros_like(g), p_compensation)
+        return layout.join_state(new_mu, new_g, p), layout.join_state(
+            new_mu_compensation, jnp.zeros_like(g), p_compensation
+        )
 
     def _apply_explicit_step(
         self, system: AttitudeSystem, x, compensation, new_mu, new_mu_compensation, h, k
     ) -> tuple[jax.Array, jax.Array]:
         layout = system.attitude_layout
-        g, group, n = layout.split(x)[1], system.group, system.group.dim
-        local, step = TurningSystem(system, self.order, g), self.increment(h, k)
-        new_g = g @ group.exp_map(group.algebra, local.angles(step))
+        g, group, n = layout.split_state(x)[1], system.group, system.group.dim
+        local, step = AttitudeChartSystem(system, self.order, g), self.increment(h, k)
+        new_g = g @ group.exp_map(group.algebra, local.rotation_angles(step))
         keeps_orbit, p_compensation = (
-            is_torque_free(system.body) and self._transporting_method.can_transport_attitude(system.body),
+            moves_by_transport_alone(system.body) and self._transporting_method.can_transport_attitude(system.body),
             None,
         )
         if system.impulse_dim:
@@ -190,18 +198,18 @@ class WithAttitude(MethodWrapper):
         if keeps_orbit:
             new_g = _align_attitude(group, new_g, p, new_mu[:n])
         new_g = group.restore_map(new_g)
-        return layout.join(new_mu, new_g, p if system.impulse_dim else None), layout.join(
+        return layout.join_state(new_mu, new_g, p if system.impulse_dim else None), layout.join_state(
             new_mu_compensation, jnp.zeros_like(g), p_compensation
         )
 
     def step_without_compensation(self, system: AttitudeSystem, x, h) -> jax.Array:
         """Return the state after a step without compensated summation: see :class:`.MetriplecticRungeKutta`."""
         layout = system.attitude_layout
-        g, group = layout.split(x)[1], system.group
-        local = TurningSystem(system, self.order, g)
+        g, group = layout.split_state(x)[1], system.group
+        local = AttitudeChartSystem(system, self.order, g)
         method: Any = pullback_method(self.method, local)
-        end = method.step_without_compensation(local, local.local_coordinates(x), h)
-        return layout.join(system.points(end), g @ group.exp_map(group.algebra, local.angles(end)))
+        end = method.step_without_compensation(local, local.coordinates_of_state(x), h)
+        return layout.join_state(system.body_states(end), g @ group.exp_map(group.algebra, local.rotation_angles(end)))
 
     def _attitude_increment(self, group, stage_angles) -> jax.Array:
         """Return the group element that rotates the attitude, for angles h xi at the stages, shape (stages, dim)."""
@@ -215,8 +223,8 @@ class WithAttitude(MethodWrapper):
         """Return the attitudes at which the torques of the stages are evaluated, shape (stages, m, m)."""
         layout = system.attitude_layout
         (mu, g), (mu_compensation, g_compensation), group = (
-            layout.split(x),
-            layout.split(compensation),
+            layout.split_state(x),
+            layout.split_state(compensation),
             system.group,
         )
         xi = (
@@ -239,7 +247,10 @@ class WithAttitude(MethodWrapper):
 
     def _stage_torques(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:
         """Return the torques at the stages, shape (stages, body components without the clock)."""
-        body, states = system.body, system.points(x) + (system.points(compensation) + h * (gauss_tableau(len(k)).A @ k))
+        body, states = (
+            system.body,
+            system.body_states(x) + (system.body_states(compensation) + h * (gauss_tableau(len(k)).A @ k)),
+        )
         if not body.torque_laws.needs_attitude:
             return jax.vmap(body.external_torque)(states)
         attitudes = self._stage_attitudes(system, x, compensation, h, k)
@@ -255,14 +266,14 @@ class WithAttitude(MethodWrapper):
             -1, -2
         )  # Ad(inverse(g)), relative
         impulse = h * jnp.einsum("i,ia,iab->b", gauss_tableau(len(stage_angles)).b, torques, actions)
-        spatial_impulse = impulse @ system.spatial_action(layout.split(x)[1])
+        spatial_impulse = impulse @ system.momentum_to_space_matrix(layout.split_state(x)[1])
         return two_sum(layout.impulse(x), layout.impulse(compensation) + spatial_impulse)
 
     def displace(self, system: AttitudeSystem, x, v) -> jax.Array:  # type: ignore[override]
         """Displace the momentum alone: functions evaluated inside a step depend on it only."""
         layout = system.attitude_layout
-        mu, g = layout.split(x)
-        return layout.join(mu + system.points(v), g, layout.impulse(x))
+        mu, g = layout.split_state(x)
+        return layout.join_state(mu + system.body_states(v), g, layout.impulse(x))
 
     @staticmethod
     def _coadjoint_increment(group, stage_angles) -> jax.Array:

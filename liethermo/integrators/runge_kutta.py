@@ -13,7 +13,7 @@ import manifolds as mf
 from ..errors import InputError
 from ..functions.frames import vector_with_inner_products
 from ..systems import System
-from ..systems.clock import error_of_step
+from ..systems.clock import convert_work_error_to_displacement
 from .base import register
 from .explicit import ExplicitMethod, StepRow, UncorrectedStep
 from .tableaus import LOBATTO_ORDERS, ErrorEstimate, ExplicitTableau, explicit_lobatto_tableau
@@ -137,7 +137,9 @@ class MetriplecticRungeKutta(ExplicitMethod):
             """Return the field, and the rates of the laws by the whole field (the motion adds rounding alone)."""
             dH = system.energy.gradient(x)
             dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
-            field = system.freeze_at(x).field(x, dH, dS, tuple(L.gradient(x) for L in system.preserved))
+            field = system.cache_tensors_at(x).field(
+                x, dH, dS, tuple(L.gradient(x) for L in system.preserved_functions)
+            )
             law_gradients = [
                 dS if law.function is system.entropy else law.function.gradient(x) for law in laws if law.sign
             ]
@@ -177,7 +179,9 @@ class MetriplecticRungeKutta(ExplicitMethod):
         t, step_length = self.tableau, h * jnp.max(jnp.abs(k[StepRow.MEAN_SLOPE]))
 
         def estimated_error(estimate: ErrorEstimate, row: int) -> jax.Array:
-            error_size = h * jnp.max(jnp.abs(error_of_step(system, x, k[row], k[StepRow.MEAN_SLOPE])))
+            error_size = h * jnp.max(
+                jnp.abs(convert_work_error_to_displacement(system, x, k[row], k[StepRow.MEAN_SLOPE]))
+            )
             ratio = error_size / jnp.where(step_length > 0.0, step_length, 1.0)
             return estimate.scale * step_length * ratio ** (self.order / estimate.order)
 

@@ -13,7 +13,7 @@ import manifolds as mf
 
 from ..errors import InputError
 from ..systems import System
-from ..systems.clock import error_of_step
+from ..systems.clock import convert_work_error_to_displacement
 from ..systems.transport import has_generator
 from ..tracing.taylor import TaylorSeriesError, check_has_taylor_series, solution_taylor_coefficients
 from .base import OneStepMethod, register
@@ -168,7 +168,9 @@ class MetriplecticTaylor(ExplicitMethod):
         error tends to 1 with h. It
         also detects a condition (``jnp.where``) whose value has changed inside the step.
         """
-        return h * jnp.max(jnp.abs(error_of_step(system, x, k[StepRow.ERROR], k[StepRow.MEAN_SLOPE])))
+        return h * jnp.max(
+            jnp.abs(convert_work_error_to_displacement(system, x, k[StepRow.ERROR], k[StepRow.MEAN_SLOPE]))
+        )
 
 
 register(*map(MetriplecticTaylor, (6, 12, 20)))

@@ -16,9 +16,9 @@ from ..errors import InputError
 from ..integrators import MetriplecticRungeKutta, OneStepMethod
 from ..results.solution import Solution
 from ..runs.adaptive import Adaptive
-from ..runs.events import EventSpecification, event_direction, event_terminal
+from ..runs.events import EventSpecification, direction_attribute_of_event, terminal_attribute_of_event
 from ..runs.integrate import integrate, solution_without_steps
-from ..runs.schedule import clip_times_to_span
+from ..runs.schedule import backward_span_message, clip_times_to_span
 from ..systems import System
 from ..systems.kind_checks import require_system
 
@@ -140,7 +140,7 @@ def solve_ivp(
     saved_times = None if t_eval is None else _checked_t_eval(t_eval, start, end)
     _check_first_step(first_step, end - start)
     arguments = _checked_event_args(args)
-    is_terminal = any(event_terminal(function) for function in event_functions)
+    is_terminal = any(terminal_attribute_of_event(function) for function in event_functions)
     if math.isinf(end) and not is_terminal:
         raise InputError("an infinite end needs an event that ends the run. Set event.terminal = True, or a finite end")
     method = MetriplecticRungeKutta(order=8) if method is None else method
@@ -229,7 +229,7 @@ def _has_event_at_start(
     """Return True if an event function has an event at the start of a run: it is zero and then changes in its
     direction."""
     (start, end), x = span, np.asarray(system.state(x0)).reshape(np.shape(x0))
-    direction = event_direction(event_function)
+    direction = direction_attribute_of_event(event_function)
     if float(event_function(start, x, *arguments)) != 0.0:
         return False
     if direction == 0 or end == start:
@@ -242,7 +242,7 @@ def _has_event_at_start(
 
 def _is_terminal_at_start(event_function: Callable, has_initial_event: bool) -> bool:
     """Return True if an event at the start of a run ends it."""
-    return has_initial_event and event_terminal(event_function) == 1
+    return has_initial_event and terminal_attribute_of_event(event_function) == 1
 
 
 def _empty_span_result(
@@ -298,7 +298,7 @@ def _checked_t_span(t_span) -> tuple[float, float]:
     if math.isnan(start) or math.isnan(end) or math.isinf(start):
         raise InputError(f"t_span must start at a finite time, got ({start:g}, {end:g})")
     if end < start:
-        raise InputError(f"t_span = ({start:g}, {end:g}) runs backwards. Integrate over ({end:g}, {start:g}) instead")
+        raise InputError(backward_span_message(start, end))
     return start, end
 
 

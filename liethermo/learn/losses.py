@@ -252,7 +252,9 @@ def differentiable_stepper(
         )
     prepared_system, method = prepare_for_method(system, method, None, has_attitude)
     base_method = method.method if isinstance(method, WithAttitude) else method
-    needs_no_compensation = isinstance(base_method, MetriplecticRungeKutta) and prepared_system.surface is None
+    needs_no_compensation = (
+        isinstance(base_method, MetriplecticRungeKutta) and prepared_system.constraint_surface is None
+    )
 
     def step(carry, h):
         if needs_no_compensation:

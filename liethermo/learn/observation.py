@@ -79,7 +79,7 @@ class Observation(NamedTuple):
     def observe(self, prepared_system: System, state, t, parameters) -> jax.Array:
         """Return the observed quantities in a state of a run at time t, as a flat array of shape (k,)."""
         layout = prepared_system.attitude_layout
-        x, attitude = (state, None) if layout is None else layout.split(state)
+        x, attitude = (state, None) if layout is None else layout.split_state(state)
         return jnp.ravel(self.function(x, attitude, t, parameters))
 
     def fingerprint_parts(self, prepared_system: System, parameters) -> list:
@@ -118,8 +118,8 @@ class Observation(NamedTuple):
         remaining ones."""
         if (layout := prepared_system.attitude_layout) is None:
             return state + z
-        (x, g), n = layout.split(state), layout.body_dim
-        return layout.join(x + z[:n], g @ layout.group.exp_map(layout.group.algebra, z[n:]))
+        (x, g), n = layout.split_state(state), layout.body_dim
+        return layout.join_state(x + z[:n], g @ layout.group.exp_map(layout.group.algebra, z[n:]))
 
 
 def make_observation(

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 from ..errors import FunctionError, InputError
 from ..runs.flow import system_with_parameters
-from ..runs.named_parameters import find_parameter
+from ..runs.named_parameters import require_parameter
 from ..systems import System
 from ..systems.kind_checks import require_system
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
@@ -37,7 +37,7 @@ def initial_parameter_values(system: System | Callable, parameters: Any) -> dict
         names = _to_name_list(parameters)
         if names is None:
             raise InputError(f"parameters must be names, or a dict from names to initial values, got {parameters!r}")
-        parameters = {name: find_parameter(system, name).value for name in names}
+        parameters = {name: require_parameter(system, name).value for name in names}
     if not isinstance(parameters, Mapping) or not all(isinstance(name, str) for name in parameters):
         raise InputError(
             "a function that builds a system needs parameters=, a dict from names to initial values, got "

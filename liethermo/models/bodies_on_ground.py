@@ -15,7 +15,7 @@ from manifolds._pytree_module import replace_fields
 
 from ..errors import InputError
 from ..systems import HeatBaths
-from ..systems.body_states import append_entropies, broadcast_batches
+from ..systems.body_states import append_bath_entropies, broadcast_batches
 from ..systems.interface import TORQUE_FREE_LAWS, TorqueLaws
 from ..systems.torque import TorqueSystem
 from .articulated_bodies import ArticulatedBodies, JointSprings, WeightPotential
@@ -129,5 +129,5 @@ class BodiesOnGround(TreeSystem, TorqueSystem):
         q = self._joint_vector_from_names(joints, "joints", degrees)
         q, rates = broadcast_batches(q, self._joint_vector_from_names(joint_rates, "joint_rates", degrees))
         momenta = jnp.einsum("...ij,...j->...i", self.mass_matrix(q), rates)
-        x = append_entropies(jnp.concatenate([q, momenta], axis=-1), self.baths, temperature)
+        x = append_bath_entropies(jnp.concatenate([q, momenta], axis=-1), self.baths, temperature)
         return super().state(x, x.ndim > 1)

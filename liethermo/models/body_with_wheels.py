@@ -14,6 +14,7 @@ import manifolds as mf
 from manifolds._pytree_module import Module
 
 from ..errors import InputError
+from ..functions.conditions import positive_condition
 from ..systems import EulerPoincareClosedSystem, LiePoissonSystem
 from ..systems.torque import (
     MAX_ARGUMENTS_WITHOUT_ATTITUDE,
@@ -21,16 +22,16 @@ from ..systems.torque import (
     torque_name,
     traced_torque_and_argument_counts,
 )
-from .inertia import checked_inertia
+from .inertia import INERTIA_CONDITION, checked_inertia
 from .parameters import checked_positive
 from .rotors import reaction_wheels
 
 
 class _Lagrangian(Module):
-    inertia: jax.Array
-    wheels: jax.Array
-    heat: jax.Array
-    temperature: jax.Array
+    inertia: jax.Array = eqx.field(metadata=INERTIA_CONDITION.metadata)
+    wheels: jax.Array = eqx.field(metadata=positive_condition("wheels").metadata)
+    heat: jax.Array = eqx.field(metadata=positive_condition("heat").metadata)
+    temperature: jax.Array = eqx.field(metadata=positive_condition("temperature").metadata)
 
     def __call__(self, xi, S):
         body, wheel = xi[:3], xi[3:]
@@ -40,7 +41,7 @@ class _Lagrangian(Module):
 
 
 class _BearingFriction(Module):
-    friction: jax.Array
+    friction: jax.Array = eqx.field(metadata=positive_condition("friction").metadata)
 
     def __call__(self, xi, S):
         return jnp.concatenate([jnp.zeros(3), -self.friction * xi[3:]])

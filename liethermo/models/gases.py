@@ -13,7 +13,7 @@ import numpy as np
 from manifolds._pytree_module import Module
 
 from ..errors import InputError
-from ..functions.conditions import checked_numbers, require_condition
+from ..functions.conditions import checked_numbers, positive_condition, require_condition
 from ..functions.energy import Function, Quadratic
 from ..functions.mechanics import Kinetic
 from ..systems import ComposedSystem, Membrane, Reaction, SimpleClosedSystem, Subsystem
@@ -37,10 +37,10 @@ class IdealGas(Module):
     c : heat capacity at constant volume over R
     """
 
-    moles: jax.Array
-    volume: jax.Array
-    temperature: float = 300.0
-    c: float = 1.5
+    moles: jax.Array = eqx.field(metadata=positive_condition("moles").metadata)
+    volume: jax.Array = eqx.field(metadata=positive_condition("volume").metadata)
+    temperature: float = eqx.field(default=300.0, metadata=positive_condition("temperature").metadata)
+    c: float = eqx.field(default=1.5, metadata=positive_condition("c").metadata)
 
     def energy(self, S, V):
         """Return the energy U (J) at an entropy (J / K) and a volume (m**3)."""
@@ -57,8 +57,8 @@ class _CylinderGasEnergy(Module):
     """The energy of a gas left or right of the piston as a function of (q, S)."""
 
     gas: IdealGas
-    area: jax.Array
-    length: jax.Array
+    area: jax.Array = eqx.field(metadata=positive_condition("area").metadata)
+    length: jax.Array = eqx.field(metadata=positive_condition("length").metadata)
     is_right: bool = eqx.field(static=True)
 
     def volume(self, q):
@@ -131,7 +131,7 @@ class _GasEnergy(Module):
     """The internal energy of the gas as a function of (q, S)."""
 
     gas: IdealGas
-    area: jax.Array
+    area: jax.Array = eqx.field(metadata=positive_condition("area").metadata)
 
     def __call__(self, y):
         return self.gas.energy(y[1], self.area * y[0])
@@ -195,7 +195,7 @@ class _PressureForce(Module):
     """The external force ``-P A``, shape (1,)."""
 
     pressure: Callable
-    area: jax.Array
+    area: jax.Array = eqx.field(metadata=positive_condition("area").metadata)
 
     def __call__(self, q, v, S, t):
         return -self.area * jnp.reshape(self.pressure(q, v, S, t), 1)
@@ -220,8 +220,8 @@ class FixedVolumeGas(Module):
     temperature : T_0 (K)
     """
 
-    heat: jax.Array
-    temperature: jax.Array
+    heat: jax.Array = eqx.field(metadata=positive_condition("the heat capacity").metadata)
+    temperature: jax.Array = eqx.field(metadata=positive_condition("temperature").metadata)
 
     def __call__(self, y):
         return self.heat * self.temperature * jnp.exp(y[0] / self.heat)
@@ -321,7 +321,7 @@ class IdealMixture(Module):
         s_k, the entropy of a particle at T = 1 in the volume 1.
     """
 
-    capacity: jax.Array
+    capacity: jax.Array = eqx.field(metadata=positive_condition("capacity").metadata)
     energy: jax.Array
     entropy: jax.Array
 
@@ -351,8 +351,8 @@ class _TwoGasEnergy(Module):
     """The energy of two gases left and right of a piston at q, in the volumes ``A q`` and ``A (L - q)``."""
 
     gas: IdealMixture
-    area: jax.Array
-    length: jax.Array
+    area: jax.Array = eqx.field(metadata=positive_condition("area").metadata)
+    length: jax.Array = eqx.field(metadata=positive_condition("length").metadata)
 
     def __call__(self, q, S, N):
         left_volume, right_volume = self.area * q[0], self.area * (self.length - q[0])
@@ -446,7 +446,7 @@ class _VesselEnergy(Module):
     """The energy of a mixture in a fixed volume as a function of (S, N)."""
 
     gas: IdealMixture
-    volume: jax.Array
+    volume: jax.Array = eqx.field(metadata=positive_condition("volume").metadata)
 
     def __call__(self, x):
         return self.gas.internal_energy(x[0], x[1:], self.volume)

@@ -12,7 +12,7 @@ from manifolds._arrays import host_array, is_traced, real_array
 from manifolds.errors import warn
 
 from ..errors import InputError
-from ..functions.conditions import checked_numbers, require_condition
+from ..functions.conditions import Condition, checked_numbers, require_condition
 
 SYMMETRY_RTOL = 1e-9
 """Largest asymmetry of a tensor of inertia, relative to its largest entry."""
@@ -123,6 +123,31 @@ def _are_positive(moments):
 
 def _are_nonnegative(moments):
     return (moments >= 0.0) & (moments < np.inf)
+
+
+def _are_positive_or_of_rods(moments):
+    """Return True for each moment, shape (..., 3), that is positive, or zero and of a slender rod."""
+    xp = np if isinstance(moments, np.ndarray) else jnp
+    _, median, largest = xp.moveaxis(xp.sort(moments, axis=-1), -1, 0)
+    is_rod = (largest - median <= EQUAL_MOMENTS_RTOL * largest)[..., None]
+    return ((moments > 0.0) | (is_rod & (moments == 0.0))) & (moments < np.inf)
+
+
+def _are_tensors_of_bodies(tensors):
+    """Return True for each symmetric positive definite tensor, shape (..., 3, 3)."""
+    xp = np if isinstance(tensors, np.ndarray) else jnp
+    asymmetry = xp.abs(tensors - xp.swapaxes(tensors, -1, -2)).max(axis=(-2, -1))
+    is_symmetric = asymmetry <= SYMMETRY_RTOL * xp.abs(tensors).max(axis=(-2, -1))
+    return is_symmetric & (xp.linalg.eigvalsh(tensors)[..., 0] > 0.0)
+
+
+INERTIA_CONDITION = Condition(
+    _are_positive_or_of_rods,
+    POSITIVE_MOMENTS_TEXT,
+    _are_tensors_of_bodies,
+    "a tensor of inertia must be symmetric and positive definite, got {value}",
+)
+"""Condition on the moments or the tensor of inertia of a body."""
 
 
 def principal_axes(inertia) -> PrincipalAxes:

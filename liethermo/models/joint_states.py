@@ -80,8 +80,8 @@ class TreeSystem(System):
         return kinetic.mechanism
 
     @property
-    def hints(self) -> EngineHints:
-        return super().hints._replace(can_unroll_newton=self.mechanism.n_joints <= MAX_UNROLLED_NEWTON_JOINTS)
+    def engine_hints(self) -> EngineHints:
+        return super().engine_hints._replace(can_unroll_newton=self.mechanism.n_joints <= MAX_UNROLLED_NEWTON_JOINTS)
 
     @with_library_settings
     def mass_matrix(self, q) -> jax.Array:

@@ -19,7 +19,7 @@ from manifolds.structures.poisson import PoissonStructure, ProductPoisson
 from ..errors import InputError
 from ..functions.energy import Energy, Quadratic
 from ..systems import HeatBaths, LiePoissonSystem
-from ..systems.body_states import append_entropies, broadcast_batches
+from ..systems.body_states import append_bath_entropies, broadcast_batches
 from ..systems.interface import MotionQuantities, TorqueLaws
 from ..tracing.programs import jit_unoptimised
 from .articulated_bodies import ArticulatedBodies, JointSprings, KineticEnergy, SquaredMomentum
@@ -262,7 +262,7 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         momenta = jnp.einsum("...ij,...j->...i", M, jnp.concatenate([Omega, rates], axis=-1))
         Pi = momenta[..., :3] if momentum is None else vector
         x = jnp.concatenate([Pi, q, momenta[..., 3:], *translation], axis=-1)
-        x = append_entropies(x, self.baths, temperature)
+        x = append_bath_entropies(x, self.baths, temperature)
         return super().state(x, x.ndim > 1)
 
     def _translation_components(self, centre_of_mass, velocity) -> tuple[jax.Array, ...]:

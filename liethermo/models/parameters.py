@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 
 from ..errors import InputError
-from ..functions.conditions import checked_numbers, require_condition
+from ..functions.conditions import checked_numbers, positive_condition, require_condition
 
 
 def checked_positive(value, name: str, count: int | None = None) -> jax.Array:
     """Return a positive number, or ``count`` positive numbers, as an array; traced values are returned unchanged."""
     array = checked_numbers(value, name, () if count is None else (count,))
-    require_condition(array, lambda a: (a > 0.0) & (a < jnp.inf), name + " must be positive and finite, got {value}")
+    positive_condition(name).require(array)
     return array
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,16 +12,19 @@ import numpy as np
 import manifolds as mf
 
 from ..dissipation.base import Damping, Dissipation
-from ..dissipation.checks import checked_rate
+from ..dissipation.checks import RATE_CONDITION, checked_rate
 from ..dissipation.factor import Factor
 from ..errors import InputError
-from ..functions.conditions import checked_numbers, require_condition
+from ..functions.conditions import checked_numbers, nonnegative_condition, require_condition
 from ..functions.energy import Quadratic
 from ..functions.frames import sqrt_or_zero
 from ..functions.indices import Indices
 from ..systems import HeatBaths, LiePoissonSystem
 from .inertia import checked_inertia, inverse_inertia
 from .parameters import checked_positive
+
+FRICTION_CONDITION = nonnegative_condition("friction")
+"""Condition on the friction of bearings."""
 
 
 class BearingFriction(Damping):
@@ -35,7 +39,7 @@ class BearingFriction(Damping):
         The bath that the friction heats.
     """
 
-    friction: jax.Array
+    friction: jax.Array = eqx.field(metadata=FRICTION_CONDITION.metadata)
 
     @property
     def _n_rotors(self) -> int:
@@ -73,7 +77,7 @@ class RotorFriction(Damping):
     bath : Indices
     """
 
-    rate: jax.Array
+    rate: jax.Array = eqx.field(metadata=RATE_CONDITION.metadata)
     axis: jax.Array
 
     def _momentum_rate(self, x, sigma) -> jax.Array:
@@ -293,7 +297,7 @@ def reaction_wheels(
     directions = jnp.atleast_2d(checked_numbers(axes, "axes"))
     n = directions.shape[0]
     k = jnp.broadcast_to(checked_numbers(friction, "friction", (), (n,)), (n,))
-    require_condition(k, lambda v: (v >= 0.0) & (v < jnp.inf), "friction must be >= 0 and finite, got {value}")
+    FRICTION_CONDITION.require(k)
     baths = HeatBaths(capacity, temperature)
     return _rotor_system(inertia, axes, wheels, lambda a: BearingFriction(k), baths, attitude, torque)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +11,7 @@ import scipy
 from manifolds._pytree_module import Module
 
 from ..errors import InputError
-from ..functions.conditions import checked_numbers
+from ..functions.conditions import checked_numbers, positive_condition
 from ..functions.energy import Energy, Function, Quadratic
 from ..functions.mechanics import Each, Kinetic
 from ..systems import ComposedSystem, Copies, EvolutionSystem
@@ -72,11 +73,11 @@ class Thermospring(Module):
     length, temperature : r_0 and T_0, at which it is slack and S = 0
     """
 
-    stiffness: jax.Array
+    stiffness: jax.Array = eqx.field(metadata=positive_condition("stiffness").metadata)
     expansion: jax.Array
-    capacity: jax.Array
-    length: jax.Array
-    temperature: jax.Array
+    capacity: jax.Array = eqx.field(metadata=positive_condition("capacity").metadata)
+    length: jax.Array = eqx.field(metadata=positive_condition("length").metadata)
+    temperature: jax.Array = eqx.field(metadata=positive_condition("temperature").metadata)
 
     def __call__(self, y):
         u = 0.5 * jnp.log(y[0] / self.length**2)

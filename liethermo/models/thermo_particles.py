@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +15,7 @@ from manifolds._arrays import is_traced
 from manifolds._pytree_module import Module
 
 from ..errors import InputError
+from ..functions.conditions import positive_condition
 from ..functions.edges import graph_edges
 from ..functions.energy import Function, Quadratic
 from ..functions.mechanics import Kinetic
@@ -29,7 +31,7 @@ def thermal_energy(x, capacity):
 class ThermalEnergy(Module):
     """The internal energy ``c exp(S / c)`` of one body, from the last component S of its state."""
 
-    capacity: jax.Array
+    capacity: jax.Array = eqx.field(metadata=positive_condition("capacity").metadata)
 
     def __call__(self, x):
         return thermal_energy(x, self.capacity)

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +22,12 @@ from manifolds._arrays import is_traced
 from manifolds._pytree_module import Module
 
 from ..errors import InputError
-from ..functions.conditions import checked_numbers, require_condition
+from ..functions.conditions import (
+    checked_numbers,
+    nonnegative_condition,
+    require_condition,
+    semidefinite_condition,
+)
 from ..functions.time_span import FunctionWithBreaks, Table, TableKind, kinks_of_table
 from ..functions.time_span import PiecewiseConstant as FunctionPiecewiseConstant
 from .inertia import checked_inertia
@@ -173,6 +179,10 @@ class Magnetic(Module):
         return jnp.cross(self.dipole, attitude.T @ field)
 
 
+GAIN_CONDITION = nonnegative_condition("gain")
+"""Condition on the gain of coils."""
+
+
 class BDot(Module):
     """The torque of magnetic coils that are driven by the rate of the field in the body, ``m = -k dB/dt``.
 
@@ -189,12 +199,12 @@ class BDot(Module):
         B, in axes in space (T).
     """
 
-    gain: jax.Array
+    gain: jax.Array = eqx.field(metadata=GAIN_CONDITION.metadata)
     field: jax.Array | Callable
 
     def __init__(self, gain, field):
         self.gain = checked_numbers(gain, "gain", (), (3,))
-        require_condition(self.gain, lambda k: (k >= 0.0) & (k < jnp.inf), "gain must be >= 0 and finite, got {value}")
+        GAIN_CONDITION.require(self.gain)
         self.field = field if callable(field) else checked_finite(field, "field", 3)
 
     def __call__(self, t, mu, attitude, velocity):
@@ -222,7 +232,7 @@ class RayleighDrag(Module):
         Angular velocity of the gas in axes in space (rad/s), such as that of the rotating atmosphere.
     """
 
-    coefficient: jax.Array
+    coefficient: jax.Array = eqx.field(metadata=semidefinite_condition("coefficient").metadata)
     gas: jax.Array
 
     def __init__(self, coefficient, gas=(0.0, 0.0, 0.0)):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class AuditedRun(Protocol):
-    """Attributes of a run that an audit reads: see :class:`liethermo.Solution`."""
+    """Run with the attributes that an audit reads, such as a :class:`liethermo.Solution`."""
 
     @property
     def energy_balance(self) -> np.ndarray: ...
@@ -82,7 +82,7 @@ class Tolerances:
 
     @classmethod
     def with_defaults(cls, **tolerances: float) -> Tolerances:
-        """Return the tolerances given by name, with the defaults of the others; InputError for an unknown name."""
+        """Return tolerances with the given values and defaults for the others; InputError for an unknown name."""
         names = [field.name for field in fields(cls)]
         unknown = [name for name in tolerances if name not in names]
         if unknown:
@@ -92,7 +92,7 @@ class Tolerances:
 
 @dataclass(frozen=True)
 class AuditRow(TableRow):
-    """A row of an audit: law, measured value, tolerance, and verdict (None if nothing is promised).
+    """Row of an audit with law, measured value, tolerance, and verdict (None if nothing is promised).
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ CONSISTENCY_ROW = "consistency"
 """Name of the row that compares short steps with the vector field."""
 
 STEPS_TAKEN_ROW = "steps taken"
-"""Name of the row for whether a run reached its end."""
+"""Name of the row that says whether a run reached its end."""
 
 FAILED_TRAJECTORIES_ROW = "trajectories that failed"
 """Name of the row that counts the trajectories of an ensemble that did not reach their end."""
@@ -238,18 +238,20 @@ class RunExtremes(NamedTuple):
 
     @classmethod
     def from_solution(cls, solution: AuditedRun) -> RunExtremes:
-        """Return the extremes of a run: those of its statistics, and of the saved states."""
+        """Return the extremes over all steps of a run, from its statistics and its saved states."""
         stats, energy, evidence = solution.stats, solution.energy_balance, solution.evidence
-        smallest, largest = stats.energy_range or (np.inf, -np.inf)
-        drift = max(largest - energy[0], energy.max() - energy[0], energy[0] - smallest, energy[0] - energy.min())
+        smallest_energy, largest_energy = stats.energy_range or (np.inf, -np.inf)
+        drift = max(
+            largest_energy - energy[0], energy.max() - energy[0], energy[0] - smallest_energy, energy[0] - energy.min()
+        )
         rounding = RoundingScale.from_series(energy, evidence.energy)
-        increment = max([*np.diff(energy), _value_or(stats.largest_energy_increment, -np.inf)])
+        increment = max([*np.diff(energy), _value_or_default(stats.largest_energy_increment, -np.inf)])
         entropy = np.full(1, np.nan) if solution.entropy is None else solution.entropy
         change = entropy - entropy[0]
         change = change[np.argmax(np.abs(change))]
         if solution.laws.entropy == "nondecreasing":
             change = -(np.maximum.accumulate(entropy) - entropy).max()
-        least_increment = min([*np.diff(entropy), _value_or(stats.least_entropy_increment, np.inf)])
+        least_increment = min([*np.diff(entropy), _value_or_default(stats.least_entropy_increment, np.inf)])
         entropy_scale = np.abs(entropy).max()
         values = (
             max(stats.steps, len(energy) - 1, 1),
@@ -262,14 +264,14 @@ class RunExtremes(NamedTuple):
             np.nan if solution.entropy is None else least_increment,
             change,
             entropy_scale,
-            _value_or(evidence.entropy, entropy_scale),
+            _value_or_default(evidence.entropy, entropy_scale),
         )
         return cls(*(np.atleast_1d(value) for value in values))
 
 
 @dataclass(frozen=True, eq=False)
 class LawCheck:
-    """A law of B trajectories, as each of them obeys it.
+    """Measured values and limits of a law along B trajectories.
 
     Attributes
     ----------
@@ -280,9 +282,9 @@ class LawCheck:
         Largest value allowed; None if nothing is promised.
     note : str
     shown_values, shown_limits : ndarray, shape (B,), or None
-        What a row shows in their place.
+        Values and limits that a row shows instead.
     total_falls : ndarray, shape (B,), or None
-        Falls of the entropy in all that are too large, although each step is within the rounding; zero for others.
+        Total fall of the entropy if it is too large although each step is within the rounding; otherwise zero.
     """
 
     law: str
@@ -303,70 +305,110 @@ class LawCheck:
 
     @property
     def excess(self) -> np.ndarray:
-        """The values less their limits, shape (B,): the trajectory with the largest excess is the worst."""
+        """Measured values minus limits, shape (B,), by which an audit selects the worst trajectory."""
         excess = self.values if self.limits is None else self.values - self.limits
         return excess if self.total_falls is None else np.where(self.total_falls > 0.0, self.total_falls, excess)
 
-    def audit_row(self, i: int, note: str = "") -> AuditRow:
-        """Return the row of an audit that shows the law for trajectory i."""
+    def audit_row(self, trajectory_index: int, note: str = "") -> AuditRow:
+        """Return the row of an audit that shows the law for one trajectory."""
         notes = [self.note, note]
-        if self.total_falls is not None and self.total_falls[i] > 0.0:
-            notes.insert(0, f"in all it falls by {self.total_falls[i]:.2g}")
+        if self.total_falls is not None and self.total_falls[trajectory_index] > 0.0:
+            notes.insert(0, f"in all it falls by {self.total_falls[trajectory_index]:.2g}")
         values = self.values if self.shown_values is None else self.shown_values
         limits = self.limits if self.shown_limits is None else self.shown_limits
-        allowed, passed = (None, None) if limits is None else (float(limits[i]), not self.is_violated[i])
-        return AuditRow(self.law, float(values[i]), allowed, passed, "; ".join(text for text in notes if text))
+        allowed_value, is_satisfied = (
+            (None, None)
+            if limits is None
+            else (float(limits[trajectory_index]), not self.is_violated[trajectory_index])
+        )
+        return AuditRow(
+            self.law,
+            float(values[trajectory_index]),
+            allowed_value,
+            is_satisfied,
+            "; ".join(text for text in notes if text),
+        )
 
 
 def check_laws(
-    run: Any, laws: Laws, tolerances: Tolerances, terms: Mapping[str, Any], has_entropy: bool
+    extremes: Any, laws: Laws, tolerances: Tolerances, term_magnitudes: Mapping[str, Any], has_entropy: bool
 ) -> list[LawCheck]:
-    """Return the laws of trajectories as each obeys them, that of the residual last; without a step all hold.
+    """Return a check of each law of energy and entropy along trajectories, then a check of the stage residual.
+
+    Trajectories without a step satisfy all laws.
 
     Parameters
     ----------
-    run : RunExtremes, or Ensemble
+    extremes : RunExtremes, or Ensemble
     laws : Laws
-        Laws promised of each trajectory.
+        Laws that are promised for each trajectory.
     tolerances : Tolerances
-    terms : mapping to float or array, shape (B,)
-        Magnitudes of the largest terms of which "energy" and "entropy" are sums, as far as they are known.
+    term_magnitudes : mapping to float or array, shape (B,)
+        Magnitudes of the largest terms of which "energy" and "entropy" are sums, if they are known.
     has_entropy : bool
-        Whether the entropy has a row if nothing is promised of it.
+        Whether the entropy has a check if nothing is promised about it.
     """
-    checks, has_stepped, name = [], run.steps > 0, " minus ".join(["energy", *laws.balance])
+    checks, has_stepped, name = [], extremes.steps > 0, " minus ".join(["energy", *laws.balance])
 
-    def check(law: str, values, limits, note: str = "", **more) -> LawCheck:
+    def make_check(law: str, values, limits, note: str = "", **other_arrays) -> LawCheck:
         limits = None if limits is None else np.where(has_stepped, limits, np.inf)
-        more = {name: np.where(has_stepped, array, 0.0) for name, array in more.items()}
-        return LawCheck(law, np.where(has_stepped, values, 0.0), limits, note, **more)
+        other_arrays = {name: np.where(has_stepped, array, 0.0) for name, array in other_arrays.items()}
+        return LawCheck(law, np.where(has_stepped, values, 0.0), limits, note, **other_arrays)
 
-    rounding = RoundingScale(run.first_energy, run.energy_sensitivity, terms.get("energy", 0.0))
-    allowed, note = rounding.allowed_change(tolerances.energy), _inexact_law_note(laws, "energy")
+    rounding = RoundingScale(extremes.first_energy, extremes.energy_sensitivity, term_magnitudes.get("energy", 0.0))
+    allowed_change, note = rounding.allowed_change(tolerances.energy), _inexact_law_note(laws, "energy")
     if laws.energy == "conserved":
-        checks.append(check(f"{name} drift", run.energy_drift, allowed, note))
+        checks.append(make_check(f"{name} drift", extremes.energy_drift, allowed_change, note))
     elif laws.energy is None:
-        checks.append(check(f"{name} drift", run.energy_drift, None, _why_no_law(laws, "energy")))
+        checks.append(make_check(f"{name} drift", extremes.energy_drift, None, _note_without_law(laws, "energy")))
     else:
-        checks.append(check(f"largest {name} increment", run.largest_energy_increment / rounding.scale, allowed, note))
-    rounding = RoundingScale(run.entropy_scale, run.entropy_sensitivity, terms.get("entropy", 0.0))
-    least, note = run.least_entropy_increment, _inexact_law_note(laws, "entropy")
-    allowed, allowed_in_all = (rounding.allowed_change(t) for t in (tolerances.entropy, tolerances.casimirs))
+        checks.append(
+            make_check(
+                f"largest {name} increment",
+                extremes.largest_energy_increment / rounding.scale,
+                allowed_change,
+                note,
+            )
+        )
+    rounding = RoundingScale(extremes.entropy_scale, extremes.entropy_sensitivity, term_magnitudes.get("entropy", 0.0))
+    least_increment, note = extremes.least_entropy_increment, _inexact_law_note(laws, "entropy")
+    allowed_change, allowed_total_change = (
+        rounding.allowed_change(t) for t in (tolerances.entropy, tolerances.casimirs)
+    )
     if laws.entropy == "conserved":
-        change = np.maximum(np.abs(run.entropy_change), -least) / rounding.scale
-        checks.append(check("entropy drift", change, allowed_in_all, note))
+        change = np.maximum(np.abs(extremes.entropy_change), -least_increment) / rounding.scale
+        checks.append(make_check("entropy drift", change, allowed_total_change, note))
     elif laws.entropy == "nondecreasing":
-        fall, is_step_allowed = -run.entropy_change, -least / rounding.scale <= allowed
-        falls_in_all = np.where(is_step_allowed & (fall > allowed_in_all * rounding.scale), fall, 0.0)
-        shown = {"shown_values": least, "shown_limits": -allowed * rounding.scale, "total_falls": falls_in_all}
-        checks.append(check("least entropy increment", -least / rounding.scale, allowed, note, **shown))
+        fall, is_step_allowed = -extremes.entropy_change, -least_increment / rounding.scale <= allowed_change
+        falls_in_all = np.where(is_step_allowed & (fall > allowed_total_change * rounding.scale), fall, 0.0)
+        shown_arrays = {
+            "shown_values": least_increment,
+            "shown_limits": -allowed_change * rounding.scale,
+            "total_falls": falls_in_all,
+        }
+        checks.append(
+            make_check(
+                "least entropy increment", -least_increment / rounding.scale, allowed_change, note, **shown_arrays
+            )
+        )
     elif has_entropy:
-        checks.append(check("least entropy increment", -least, None, _why_no_law(laws, "entropy"), shown_values=least))
-    return [*checks, check("stage residual", np.where(run.ok, run.residual, 0.0), tolerances.residual)]
+        checks.append(
+            make_check(
+                "least entropy increment",
+                -least_increment,
+                None,
+                _note_without_law(laws, "entropy"),
+                shown_values=least_increment,
+            )
+        )
+    return [
+        *checks,
+        make_check("stage residual", np.where(extremes.ok, extremes.residual, 0.0), tolerances.residual),
+    ]
 
 
 def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
-    """Audit a run: see :meth:`liethermo.Solution.audit`."""
+    """Return the audit of the laws, the accuracy and the status of a run: see :meth:`liethermo.Solution.audit`."""
     stats, laws, evidence = solution.stats, solution.laws, solution.evidence
     extremes = RunExtremes.from_solution(solution)
     checks = check_laws(extremes, laws, tolerances, evidence.terms, solution.entropy is not None)
@@ -379,7 +421,7 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
         change = invariant_drift.change
         if name in laws.conserved:
             drifts.append(change)
-            rows.append(invariant_row(name, invariant_drift, tolerances))
+            rows.append(invariant_drift_row(name, invariant_drift, tolerances))
         elif name in laws.unpromised:
             rows.append(AuditRow(f"drift of {name}", change, None, None, UNPROMISED_CONSTANT_NOTE))
         else:
@@ -426,13 +468,13 @@ def audit_run(solution: AuditedRun, tolerances: Tolerances) -> Audit:
     )
 
 
-def invariant_row(name: str, drift: InvariantDrift, tolerances: Tolerances) -> AuditRow:
-    """Return the row of a function that is conserved."""
+def invariant_drift_row(name: str, drift: InvariantDrift, tolerances: Tolerances) -> AuditRow:
+    """Return the audit row that judges the drift of a conserved function."""
     return _judged_row(f"drift of {name}", drift.change, drift.allowed_change(tolerances.casimirs))
 
 
 def _spatial_momentum_row(change: float, laws: Laws, tolerances: Tolerances) -> AuditRow:
-    """Return the row of the spatial momentum, which is constant without an external torque, or less its impulse."""
+    """Return the audit row of the spatial momentum, less the impulse of external torques if the ledger has it."""
     name = "momentum in space"
     if any(entry.startswith("impulse") for entry in laws.ledger):
         name += " less the impulse"
@@ -446,14 +488,14 @@ def _spatial_momentum_row(change: float, laws: Laws, tolerances: Tolerances) -> 
 UNKNOWN_CONSTANCY_NOTE = (
     "whether the system conserves this function is unknown: it could not be evaluated at any point that was tried"
 )
-"""Note of a function of which it is unknown whether the system conserves it."""
+"""Note of a function for which no test could decide whether the system conserves it."""
 
 UNPROMISED_CONSTANT_NOTE = "a constant of this system, but the method does not conserve it exactly"
 """Note of a conserved function that the method does not conserve exactly."""
 
 
 def accuracy_and_consistency_rows(evidence: Evidence, tolerances: Tolerances) -> list[AuditRow]:
-    """Return the rows of accuracy and consistency."""
+    """Return the audit rows of accuracy (local error) and of consistency (with the vector field), if measured."""
     rows, inconsistency = [_accuracy_row(evidence, tolerances)], evidence.inconsistency
     if inconsistency is not None:
         row = _judged_row(CONSISTENCY_ROW, inconsistency, tolerances.consistency)
@@ -463,12 +505,12 @@ def accuracy_and_consistency_rows(evidence: Evidence, tolerances: Tolerances) ->
 
 
 def condition_rows(evidence: Evidence) -> list[AuditRow]:
-    """Return the rows of the conditions of a run, or of an ensemble, beside its laws."""
+    """Return the audit rows of conditions besides the laws, such as the positivity of a density matrix."""
     return [AuditRow(c.name, c.value, c.limit, c.holds, c.note, c.concerns_model) for c in evidence.conditions]
 
 
 def _accuracy_row(evidence: Evidence, tolerances: Tolerances) -> AuditRow:
-    """Return the row that judges whether the steps resolve the motion."""
+    """Return the audit row that judges by the largest local error whether the steps resolve the motion."""
     if evidence.local_error is None:
         return AuditRow(ACCURACY_ROW, np.nan, None, None, "the local errors were not estimated")
     row = _judged_row(ACCURACY_ROW, evidence.local_error, tolerances.accuracy)
@@ -478,10 +520,10 @@ def _accuracy_row(evidence: Evidence, tolerances: Tolerances) -> AuditRow:
     )
 
 
-def coverage_text(evidence: Evidence, steps: int) -> str:
-    """Return how many of the steps were checked; empty if all were."""
+def coverage_text(evidence: Evidence, n_steps: int) -> str:
+    """Return a text that says how many of the steps were checked, or "" if all were."""
     n_checked = evidence.looked
-    return "" if n_checked is None or n_checked >= steps else f"checked {n_checked:,} of {steps:,} steps"
+    return "" if n_checked is None or n_checked >= n_steps else f"checked {n_checked:,} of {n_steps:,} steps"
 
 
 INEXACT_LAW_NOTE = "not kept exactly by this method"
@@ -496,9 +538,9 @@ def _inexact_law_note(laws: Laws, law: str) -> str:
     return INEXACT_LAW_NOTE if law in laws.inexact else ""
 
 
-def _why_no_law(laws: Laws, law: str) -> str:
+def _note_without_law(laws: Laws, law: str) -> str:
     return "a law of the mean: it fluctuates on paths" if law in laws.mean else UNPROMISED_NOTE
 
 
-def _value_or(value: float | None, default: float) -> float:
+def _value_or_default(value: float | None, default: float) -> float:
     return default if value is None else value

@@ -21,7 +21,7 @@ from .rounding_scale import InvariantDrift
 
 @dataclass(frozen=True)
 class Evidence:
-    """Data for the audit of a run besides its series.
+    """Measured data that an audit of a run needs besides the series of states, energy and entropy.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class Evidence:
 
 
 def merge_evidence(evidence_list: Sequence[Evidence]) -> Evidence:
-    """Return the joint evidence of several sets of runs: the maximum of each number."""
+    """Return the joint evidence of several sets of runs, with the maximum of each quantity."""
     names = dict.fromkeys(name for evidence in evidence_list for name in evidence.terms)
     terms = {name: max(evidence.terms.get(name, 0.0) for evidence in evidence_list) for name in names}
     conditions = worst_conditions(evidence.conditions for evidence in evidence_list)
@@ -74,23 +74,27 @@ def merge_evidence(evidence_list: Sequence[Evidence]) -> Evidence:
     inconsistency = max(
         (evidence.inconsistency for evidence in evidence_list if evidence.inconsistency is not None), default=None
     )
-    merged = Evidence(terms=terms, inconsistency=inconsistency, conditions=conditions, drifts=drifts)
-    with_error = [evidence for evidence in evidence_list if evidence.local_error is not None]
-    if not with_error:
-        return merged
-    worst = max(with_error, key=lambda evidence: np.nan_to_num(evidence.local_error or 0.0, nan=np.inf))
-    n_checked = sum(evidence.looked or 0 for evidence in with_error)
-    return dataclasses.replace(merged, local_error=worst.local_error, error_time=worst.error_time, looked=n_checked)
+    merged_evidence = Evidence(terms=terms, inconsistency=inconsistency, conditions=conditions, drifts=drifts)
+    evidence_with_error = [evidence for evidence in evidence_list if evidence.local_error is not None]
+    if not evidence_with_error:
+        return merged_evidence
+    worst_evidence = max(
+        evidence_with_error, key=lambda evidence: np.nan_to_num(evidence.local_error or 0.0, nan=np.inf)
+    )
+    n_checked = sum(evidence.looked or 0 for evidence in evidence_with_error)
+    return dataclasses.replace(
+        merged_evidence, local_error=worst_evidence.local_error, error_time=worst_evidence.error_time, looked=n_checked
+    )
 
 
-def largest_drifts(runs: Iterable[Mapping[str, InvariantDrift]]) -> dict[str, InvariantDrift]:
-    """Return the drifts of several runs, for each function the one that is largest relative to its rounding scale."""
-    largest: dict[str, InvariantDrift] = {}
-    for name, drift in (item for drifts in runs for item in drifts.items()):
-        other = largest.setdefault(name, drift)
-        if not drift.change <= other.change:
-            largest[name] = drift
-    return largest
+def largest_drifts(drifts_of_runs: Iterable[Mapping[str, InvariantDrift]]) -> dict[str, InvariantDrift]:
+    """Return the largest drift of each function over several runs, relative to its rounding scale, by name."""
+    largest_by_name: dict[str, InvariantDrift] = {}
+    for name, drift in (item for drifts in drifts_of_runs for item in drifts.items()):
+        largest_drift_so_far = largest_by_name.setdefault(name, drift)
+        if not drift.change <= largest_drift_so_far.change:
+            largest_by_name[name] = drift
+    return largest_by_name
 
 
 VELOCITY_AXES = {"angular_velocity": "axis", "rotor_rates": "rotor", "joint_rates": "joint_coordinate"}
@@ -98,7 +102,7 @@ VELOCITY_AXES = {"angular_velocity": "axis", "rotor_rates": "rotor", "joint_rate
 
 
 class AuditableResult(SaveableResult):
-    """A result with the evidence for its audit, or with the function that computes it."""
+    """A result of a run that can be audited, because it has evidence or a function that computes evidence."""
 
     state_fields: ClassVar[tuple[str, ...]] = ("x",)
     """Names of the fields that are states, shape (..., n)."""
@@ -120,13 +124,15 @@ class AuditableResult(SaveableResult):
         """
         return {} if self.x is None else self.split_by_joint(self.x, 0)
 
-    def split_by_joint(self, values: np.ndarray, first: int) -> dict[str, np.ndarray]:
-        """Return joint coordinates or their rates by the name of the body, from arrays, shape (..., n).
+    def split_by_joint(self, values: np.ndarray, first_state_index: int) -> dict[str, np.ndarray]:
+        """Return joint coordinates or joint rates by the name of the body, from ``values``, shape (..., n).
 
-        The values of a joint begin at its index in a state less ``first``.
+        Column 0 of ``values`` belongs to the component ``first_state_index`` of a state.
         """
         return {
-            name: values[..., start - first] if end - start == 1 else values[..., start - first : end - first]
+            name: values[..., start - first_state_index]
+            if end - start == 1
+            else values[..., start - first_state_index : end - first_state_index]
             for name, (start, end) in self.provenance.get("joints", {}).items()
         }
 
@@ -136,15 +142,15 @@ class AuditableResult(SaveableResult):
         return Evidence() if self.evidence_source is None else self.evidence_source()
 
     def velocities(self) -> dict[str, np.ndarray]:
-        """Return the velocities that belong to the states, by name: of a rigid body, its rotors, and of joints."""
+        """Return the velocities at the saved states by name: of a rigid body, of its rotors, and of joints."""
         return {name: source() for name, source in self.velocity_sources.items()}
 
     def __getstate__(self) -> dict[str, Any]:  # a pickled copy has the evidence itself, not the function
         fields = {name: getattr(self, name) for name in vars(self)}
         fields |= {"evidence": self.evidence, "evidence_source": None}
-        return fields | {"velocity_sources": copies_of_velocities(self.velocities())}
+        return fields | {"velocity_sources": velocity_copy_functions(self.velocities())}
 
 
-def copies_of_velocities(series: Mapping[str, np.ndarray]) -> dict[str, Callable[[], np.ndarray]]:
-    """Return the functions that copy the velocities among arrays, by name."""
-    return {name: functools.partial(np.copy, series[name]) for name in VELOCITY_AXES if name in series}
+def velocity_copy_functions(arrays_by_name: Mapping[str, np.ndarray]) -> dict[str, Callable[[], np.ndarray]]:
+    """Return functions without arguments that return copies of the velocity arrays, by name."""
+    return {name: functools.partial(np.copy, arrays_by_name[name]) for name in VELOCITY_AXES if name in arrays_by_name}

@@ -24,16 +24,16 @@ from .audit import (
     check_laws,
     condition_rows,
     coverage_text,
-    invariant_row,
+    invariant_drift_row,
 )
-from .audit_evidence import AuditableResult, Evidence, copies_of_velocities
+from .audit_evidence import AuditableResult, Evidence, velocity_copy_functions
 from .events import Events
 from .netcdf import (
     ENSEMBLE_FORMAT,
-    array_of_shape,
     build_dataset,
     dataclass_from_json,
     join_complex,
+    numeric_array_of_shape,
     split_complex,
     state_axis_names,
 )
@@ -64,7 +64,7 @@ STATUS_MESSAGES = {
 
 @dataclass(frozen=True)
 class Ensemble(AuditableResult):
-    """The result of :func:`ensemble`: B trajectories, which come first in every array.
+    """The result of :func:`ensemble`: B trajectories, which are the first axis of every array.
 
     ``e[i]`` is one trajectory as a :class:`Solution`, and iterating over an ensemble gives all of them.
 
@@ -172,8 +172,8 @@ class Ensemble(AuditableResult):
         return np.where(self.status == StatusCode.EVENT, self.end_time, np.nan)
 
     def __repr__(self) -> str:
-        completed = int(np.sum(self.ok))
-        return f"Ensemble({len(self.status)} trajectories to t = {np.max(self.end_time):g}, {completed} completed)"
+        n_completed = int(np.sum(self.ok))
+        return f"Ensemble({len(self.status)} trajectories to t = {np.max(self.end_time):g}, {n_completed} completed)"
 
     # -- one trajectory -------------------------------------------------------------------------------------------
 
@@ -189,7 +189,7 @@ class Ensemble(AuditableResult):
         InputError
             If no states were kept, or the trajectory is inadmissible.
         """
-        i = self._member_index(i)
+        i = self._checked_member_index(i)
         if self.x is None:
             raise InputError('no states were kept: run the ensemble with outputs="final" or "trajectory"')
         if self.status[i] == StatusCode.INADMISSIBLE:
@@ -199,7 +199,7 @@ class Ensemble(AuditableResult):
     def __iter__(self) -> Iterator[Solution]:
         return (self[i] for i in range(len(self)))
 
-    def _member_index(self, i) -> int:
+    def _checked_member_index(self, i) -> int:
         if isinstance(i, bool) or not isinstance(i, int | np.integer):
             raise InputError(f"the index of a trajectory must be an integer, got {i!r}")
         if not -len(self) <= i < len(self):
@@ -207,8 +207,8 @@ class Ensemble(AuditableResult):
         return int(i) % len(self)
 
     def message(self, i: int) -> str:
-        """Return how a trajectory ended, as a text that begins with its index."""
-        i = self._member_index(i)
+        """Return a text that begins with the index of a trajectory and says how the trajectory ended."""
+        i = self._checked_member_index(i)
         facts = {"t": self.end_time[i], "n": self.steps[i], "next": self.steps[i] + 1, "r": self.residual[i]}
         code, reason = StatusCode(self.status[i]), self.reasons.get(i, "")
         text = STATUS_MESSAGES[code].format(reason=reason, **facts)
@@ -218,7 +218,7 @@ class Ensemble(AuditableResult):
 
     def member_status(self, i: int) -> Status:
         """Return the status of a trajectory."""
-        i = self._member_index(i)
+        i = self._checked_member_index(i)
         residual = float(np.nan_to_num(self.residual[i]))
         return Status(
             StatusCode(self.status[i]), self.message(i), int(self.steps[i]), float(self.end_time[i]), residual
@@ -240,14 +240,16 @@ class Ensemble(AuditableResult):
         )
 
     def member_solution(self, i: int) -> Solution:
-        """Return one trajectory as it is stored here, without Casimirs."""
+        """Return one trajectory as a solution with the data of this ensemble, without Casimirs."""
         has_time_series = self.energy.ndim == 2
         is_reached = np.isfinite(self.energy[i]) if has_time_series else np.array([True])
         work = None if self.work is None else self.work[i]
 
-        def series(values, initial_value):
-            """Return the values at the saved times, or at both ends."""
-            return values[i][is_reached] if has_time_series else np.stack([initial_value, values[i]])
+        def series(values_of_members, initial_value):
+            """Return the values of this trajectory at its saved times, or at its start and end."""
+            return (
+                values_of_members[i][is_reached] if has_time_series else np.stack([initial_value, values_of_members[i]])
+            )
 
         assert self.x is not None
         first_energy = self.first_energy[i]
@@ -285,7 +287,7 @@ class Ensemble(AuditableResult):
         assert self.entropy is not None
         return self.entropy[i, 0] if self.entropy.ndim == 2 else self.entropy[i] - self.entropy_change[i]
 
-    # -- all of them ----------------------------------------------------------------------------------------------
+    # -- all trajectories -----------------------------------------------------------------------------------------
 
     def __str__(self) -> str:
         counts = [
@@ -325,9 +327,9 @@ class Ensemble(AuditableResult):
         limits = Tolerances.with_defaults(energy=energy, entropy=entropy, **tolerances)
         has_stepped, drifts = self.steps > 0, self.evidence.drifts
         checks = check_laws(self, self.laws, limits, self.evidence.terms, self.entropy is not None)
-        worst = [(check, int(np.argmax(check.excess))) for check in checks]
-        *rows, residual_row = (check.audit_row(i, f"worst is trajectory {i}") for check, i in worst)
-        rows += [invariant_row(name, drift, limits) for name, drift in drifts.items()]
+        worst_trajectories = [(check, int(np.argmax(check.excess))) for check in checks]
+        *rows, residual_row = (check.audit_row(i, f"worst is trajectory {i}") for check, i in worst_trajectories)
+        rows += [invariant_drift_row(name, drift, limits) for name, drift in drifts.items()]
         rows += [residual_row, *condition_rows(self.evidence)]
         if self.evidence_source is not None or self.evidence.local_error is not None:
             rows += accuracy_and_consistency_rows(self.evidence, limits)
@@ -398,17 +400,17 @@ class Ensemble(AuditableResult):
         KeyError, TypeError or ValueError if a part is missing or does not fit.
         """
         if len(series["time"]) != int(attributes["times"]):
-            raise ValueError(f"{len(series['time'])} times of {attributes['times']}")
-        n_trajectories, n_times = len(series["x0"]), len(array_of_shape(series, "time", (None,)))
-        per_member = {name: array_of_shape(series, name, (n_trajectories,)) for name in PER_MEMBER_FIELDS}
+            raise ValueError(f"it has {len(series['time'])} times, and {attributes['times']} were written")
+        n_trajectories, n_times = len(series["x0"]), len(numeric_array_of_shape(series, "time", (None,)))
+        per_member = {name: numeric_array_of_shape(series, name, (n_trajectories,)) for name in PER_MEMBER_FIELDS}
         time_series = {
-            name: array_of_shape(series, name, (n_trajectories,), (n_trajectories, n_times))
+            name: numeric_array_of_shape(series, name, (n_trajectories,), (n_trajectories, n_times))
             for name in TIME_SERIES_FIELDS
             if name in series
         }
         states = {name: series[name] for name in ("x0", "x", "attitude0", "attitude") if name in series}
         for name in states:
-            array_of_shape(series, name, (n_trajectories, *[None] * max(series[name].ndim - 1, 1)))
+            numeric_array_of_shape(series, name, (n_trajectories, *[None] * max(series[name].ndim - 1, 1)))
         for name in ("attitude", "attitude0"):
             if name in states:
                 states[name] = join_complex(states[name])
@@ -428,7 +430,7 @@ class Ensemble(AuditableResult):
             provenance=provenance,
             events=Events.from_dataset(series),
             evidence_source=lambda: evidence,
-            velocity_sources=copies_of_velocities(series),
+            velocity_sources=velocity_copy_functions(series),
         )
 
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .netcdf import array_of_shape, state_axis_names
+from .netcdf import numeric_array_of_shape, state_axis_names
 
 
 class EventSeries(NamedTuple):
@@ -30,7 +30,7 @@ class EventSeries(NamedTuple):
     trajectory: np.ndarray
 
     def select(self, is_selected: np.ndarray) -> EventSeries:
-        """Return the events for which a mask is true."""
+        """Return the events for which the mask ``is_selected``, shape (events,), is True."""
         return EventSeries(self.name, self.t[is_selected], self.x[is_selected], self.trajectory[is_selected])
 
 
@@ -50,7 +50,7 @@ class Events(tuple[EventSeries, ...]):
         return [series.x for series in self]
 
     def select_trajectory(self, i: int) -> Events:
-        """Return the events of one trajectory."""
+        """Return the events of trajectory i of an ensemble, as events of a single run."""
         return Events(
             series.select(series.trajectory == i)._replace(
                 trajectory=np.zeros((series.trajectory == i).sum(), dtype=int)
@@ -61,7 +61,7 @@ class Events(tuple[EventSeries, ...]):
     # -- files --------------------------------------------------------------------------------------------------------
 
     def dataset_variables(self) -> dict[str, Any]:
-        """Return the variables of an ``xarray.Dataset`` that hold the events; none without event functions."""
+        """Return the variables of an ``xarray.Dataset`` that hold the events; {} without event functions."""
         if not self:
             return {}
         counts, x = [len(series.t) for series in self], np.concatenate(self.states)
@@ -74,16 +74,16 @@ class Events(tuple[EventSeries, ...]):
         }
 
     @classmethod
-    def from_dataset(cls, series: Mapping[str, np.ndarray]) -> Events:
-        """Return the events from the variables of a file; KeyError or ValueError if one is missing or does not fit."""
-        if "event_name" not in series:
+    def from_dataset(cls, variables: Mapping[str, np.ndarray]) -> Events:
+        """Return the events stored in the variables of a file; KeyError or ValueError if a variable does not fit."""
+        if "event_name" not in variables:
             return cls()
-        t = array_of_shape(series, "event_t", (None,))
+        t = numeric_array_of_shape(variables, "event_t", (None,))
         function, trajectory = (
-            array_of_shape(series, f"event_{name}", (len(t),)) for name in ("function", "trajectory")
+            numeric_array_of_shape(variables, f"event_{name}", (len(t),)) for name in ("function", "trajectory")
         )
-        x = array_of_shape(series, "event_x", (len(t), *[None] * (series["event_x"].ndim - 1)))
+        x = numeric_array_of_shape(variables, "event_x", (len(t), *[None] * (variables["event_x"].ndim - 1)))
         return cls(
             EventSeries(str(name), t[function == k], x[function == k], trajectory[function == k].astype(int))
-            for k, name in enumerate(series["event_name"])
+            for k, name in enumerate(variables["event_name"])
         )

@@ -30,7 +30,7 @@ NORM_TOLERANCE = 1e-3
 
 
 class AttitudeHistory(NamedTuple):
-    """Attitudes and angular velocities at times.
+    """Attitudes of a body, and angular velocities if they are known, at several times.
 
     Attributes
     ----------
@@ -146,12 +146,12 @@ def read_csv(path: str | os.PathLike) -> AttitudeHistory:
         raise FileError(f"{path} must have {len(header)} numbers in each line after the names, and at least one line")
     columns = [split_label(name) for name in header]
     names = [name for name, _ in columns]
-    missing = [name for name in ("t", *QUATERNION_COLUMNS) if name not in names]
+    missing_columns = [name for name in ("t", *QUATERNION_COLUMNS) if name not in names]
     rate_names = [name for name in RATE_COLUMNS if name in names]
     if rate_names:
-        missing += [name for name in RATE_COLUMNS if name not in names]
-    if missing:
-        raise FileError(f"{path} has no column {missing[0]!r}; its columns are {', '.join(header)}")
+        missing_columns += [name for name in RATE_COLUMNS if name not in names]
+    if missing_columns:
+        raise FileError(f"{path} has no column {missing_columns[0]!r}; its columns are {', '.join(header)}")
     units = dict(columns)
     time_factor = _factor_to_si(path, "times", units["t"], "s")
     q = values[:, [names.index(name) for name in QUATERNION_COLUMNS]]
@@ -167,20 +167,22 @@ def read_csv(path: str | os.PathLike) -> AttitudeHistory:
     return AttitudeHistory(time_factor * values[:, names.index("t")], np.asarray(attitude), rates)
 
 
-def _factor_to_si(path: Path, quantity: str, name: str, si_unit: str) -> float:
-    """Return the factor from a unit, by default the SI unit, to the SI unit of a quantity in a file.
+def _factor_to_si(path: Path, quantity: str, unit_name: str, si_unit: str) -> float:
+    """Return the factor that converts a unit in a file to the SI unit of the quantity; 1 without a unit.
 
     Raises
     ------
     FileError
-        If the unit is not known, or is one of another quantity.
+        If the unit is not known, or belongs to another quantity.
     """
     try:
-        unit = parse_unit(name or si_unit)
+        unit = parse_unit(unit_name or si_unit)
     except InputError as error:
-        raise FileError(f"{path} has {quantity} in {name!r}: {error}") from None
+        raise FileError(f"{path} has {quantity} in {unit_name!r}: {error}") from None
     if unit.dimension != parse_unit(si_unit).dimension:
-        raise FileError(f"{path} has {quantity} in {name!r}, a unit of another kind. Convert the column to {si_unit}")
+        raise FileError(
+            f"{path} has {quantity} in {unit_name!r}, a unit of another kind. Convert the column to {si_unit}"
+        )
     return unit.factor
 
 

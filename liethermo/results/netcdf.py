@@ -84,15 +84,15 @@ DEFAULT_UNITS = {"quaternion": "1", "nutation": "rad", "precession": "rad", "spi
 
 
 def unit_of_variable(name: str, units: Mapping[str, str]) -> str | None:
-    """Return the unit of a variable for the units that a user gives; None if it is unknown."""
+    """Return the unit of a variable, from the units that a user gives by name; None if the unit is unknown."""
     if name in ("angular_velocity", "rotor_rates") and "time" in units:
         return units.get(name, f"rad/{units['time']}")
     return units.get(name, DEFAULT_UNITS.get(name))
 
 
-def state_axis_names(axes: int) -> list[str]:
-    """Return the names of the axes of a state: its sites, if it has any, and its components."""
-    sites = ["site"] if axes == 2 else [f"site_{i + 1}" for i in range(axes - 1)]
+def state_axis_names(n_axes: int) -> list[str]:
+    """Return the names of the axes of a state with ``n_axes`` axes: those of its sites, then "component"."""
+    sites = ["site"] if n_axes == 2 else [f"site_{i + 1}" for i in range(n_axes - 1)]
     return [*sites, "component"]
 
 
@@ -158,7 +158,7 @@ def write_dataset(dataset: xarray.Dataset, path: str | os.PathLike) -> Path:
     path = Path(path)
     float_names = [name for name, v in dataset.variables.items() if v.dtype.kind == "f" and v.size]
     buffer = io.BytesIO()
-    with _synchronous_dask():
+    with _use_synchronous_dask():
         dataset.to_netcdf(buffer, engine="h5netcdf", encoding={name: {"fletcher32": True} for name in float_names})
     buffer.seek(0, io.SEEK_END)
     buffer.write(CHECKSUM_TAG + hashlib.sha256(buffer.getbuffer()).hexdigest().encode())
@@ -169,8 +169,8 @@ def write_dataset(dataset: xarray.Dataset, path: str | os.PathLike) -> Path:
 
 
 @contextlib.contextmanager
-def _synchronous_dask() -> Iterator[None]:
-    """Keep xarray from asking a scheduler of Dask for a lock: a client might be of a scheduler that is gone."""
+def _use_synchronous_dask() -> Iterator[None]:
+    """Make xarray write without a Dask scheduler, because a Dask client may belong to a scheduler that has stopped."""
     if "dask" not in sys.modules:
         yield
         return
@@ -272,24 +272,29 @@ def _is_dimension_scale(variable) -> bool:
     return bytes(variable.attrs.get("NAME", b"")).startswith(b"This is a netCDF dimension but not a netCDF variable")
 
 
-def dataclass_from_json(cls: type[T], data: Any) -> T:
-    """Build an object of the dataclass ``cls`` from JSON data; ValueError if the data do not fit."""
+def dataclass_from_json(cls: type[T], json_data: Any) -> T:
+    """Return an object of the dataclass ``cls`` with the fields in JSON data; ValueError if the data do not fit."""
     import pydantic
 
     field_names = {field.name for field in fields(cls)}  # type: ignore[arg-type]
-    if not isinstance(data, dict) or not field_names.issuperset(data):
+    if not isinstance(json_data, dict) or not field_names.issuperset(json_data):
         raise ValueError(f"its {cls.__name__.lower()} was not written by this version")
     try:
-        return pydantic.TypeAdapter(cls).validate_python(data)
+        return pydantic.TypeAdapter(cls).validate_python(json_data)
     except pydantic.ValidationError as error:
         first_error = error.errors()[0]
         location = ".".join(map(str, first_error["loc"]))
         raise ValueError(f"its {cls.__name__.lower()} cannot be used: {location} {first_error['msg']}") from None
 
 
-def array_of_shape(series: Mapping[str, np.ndarray], name: str, *shapes: tuple[int | None, ...]) -> np.ndarray:
-    """Return a numeric array of a file; ValueError unless it has one of the shapes, where None is any length."""
-    array = series[name]
+def numeric_array_of_shape(
+    variables: Mapping[str, np.ndarray], name: str, *shapes: tuple[int | None, ...]
+) -> np.ndarray:
+    """Return a numeric array among the variables of a file; ValueError unless it has one of the shapes.
+
+    None in a shape stands for any length.
+    """
+    array = variables[name]
     matches = [
         len(s) == array.ndim and all(n in (None, m) for n, m in zip(s, array.shape, strict=True)) for s in shapes
     ]
@@ -298,21 +303,25 @@ def array_of_shape(series: Mapping[str, np.ndarray], name: str, *shapes: tuple[i
     return array
 
 
-def split_complex(values: np.ndarray) -> np.ndarray:
-    """Return matrices with real and imaginary parts along a last axis, because NetCDF has no complex numbers."""
-    return np.stack([values.real, values.imag][: 1 + np.iscomplexobj(values)], axis=-1)
+def split_complex(matrices: np.ndarray) -> np.ndarray:
+    """Return matrices with real and imaginary parts along a new last axis, because NetCDF has no complex numbers."""
+    return np.stack([matrices.real, matrices.imag][: 1 + np.iscomplexobj(matrices)], axis=-1)
 
 
-def join_complex(parts: np.ndarray) -> np.ndarray:
-    """Return the matrices that :func:`split_complex` has split."""
-    return parts[..., 0] if parts.shape[-1] == 1 else parts[..., 0] + 1j * parts[..., 1]
+def join_complex(split_matrices: np.ndarray) -> np.ndarray:
+    """Return the real or complex matrices of which :func:`split_complex` stored the parts along the last axis."""
+    return (
+        split_matrices[..., 0]
+        if split_matrices.shape[-1] == 1
+        else split_matrices[..., 0] + 1j * split_matrices[..., 1]
+    )
 
 
-def checksum(series: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> str:
+def checksum(variables: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> str:
     """Return the SHA-256 of the names, types, shapes and bytes of all variables, and of the attributes."""
     digest = hashlib.sha256()
-    for name in sorted(series):
-        values = np.asarray(series[name])
+    for name in sorted(variables):
+        values = np.asarray(variables[name])
         is_text = values.dtype.kind in "OUS"
         type_code = "text" if is_text or not values.size else values.dtype.newbyteorder("<").str
         digest.update(json.dumps([name, type_code, values.shape]).encode())

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..models.inertia import EQUAL_MOMENTS_RTOL
-from ..systems.rotations import check_scalar_place, checked_sequence
+from ..systems.rotations import axis_indices_of_sequence, check_quaternion_order
 from .audit_evidence import VELOCITY_AXES, AuditableResult
 
 ROTATION_GROUPS = ("SO(3)", "SE(3)")
@@ -39,8 +39,8 @@ def quaternions(solution: AuditableResult, scalar: Literal["last", "first"] = "l
     InputError
         If it has no such attitudes.
     """
-    check_scalar_place(scalar)
-    g = _attitudes(solution)
+    check_quaternion_order(scalar)
+    g = _require_rotation_matrices(solution)
     has_times = _is_time_series(solution)
     is_finite = np.isfinite(g).all(axis=(-2, -1), keepdims=True)
     q = Rotation.from_matrix(np.where(is_finite, g, np.eye(3)).reshape(-1, 3, 3)).as_quat().reshape(*g.shape[:-2], 4)
@@ -72,14 +72,14 @@ def rotation(solution: AuditableResult) -> Rotation:
     InputError
         If it has no such attitudes, or some of them are not known because trajectories have ended early.
     """
-    g = _attitudes(solution)
+    g = _require_rotation_matrices(solution)
     if not np.isfinite(g).all():
         raise InputError("some trajectories have ended early, so not all attitudes are known. Use rotation(e[i])")
     return Rotation.from_matrix(g)
 
 
 def euler_angles(solution: AuditableResult, sequence: str = "zyx", degrees: bool = False) -> np.ndarray:
-    """Return Euler angles of the attitudes, as ``scipy.spatial.transform.Rotation.as_euler`` has them.
+    """Return Euler angles of the attitudes, in the convention of ``scipy.spatial.transform.Rotation.as_euler``.
 
     Parameters
     ----------
@@ -103,9 +103,9 @@ def euler_angles(solution: AuditableResult, sequence: str = "zyx", degrees: bool
     InputError
         If it has no such attitudes, or the sequence is not of three letters.
     """
-    if len(checked_sequence(sequence)) != 3:
+    if len(axis_indices_of_sequence(sequence)) != 3:
         raise InputError(f"sequence must have three letters, got {sequence!r}")
-    g = _attitudes(solution)
+    g = _require_rotation_matrices(solution)
     is_finite = np.isfinite(g).all(axis=(-2, -1), keepdims=True)
     rotations = Rotation.from_matrix(np.where(is_finite, g, np.eye(3)).reshape(-1, 3, 3))
     with warnings.catch_warnings():
@@ -141,7 +141,7 @@ def angular_velocity(
         If the system has no rigid body, no states were kept, or the frame is "space" without attitudes.
     """
     absence = "no angular velocity: its system contains no rigid body on so(3) or se(3)"
-    omega = _vectors_in_frame(solution, _velocities_of(solution, "angular_velocity", absence), frame)
+    omega = _vectors_in_frame(solution, _require_velocities(solution, "angular_velocity", absence), frame)
     return np.rad2deg(omega) if degrees else omega
 
 
@@ -173,21 +173,21 @@ def rotor_rates(solution: AuditableResult, degrees: bool = False) -> np.ndarray:
     >>> lt.bodies.rotor_rates(run)[0].round(12).tolist()
     [20.0, 0.0, 5.0]
     """
-    rates = _velocities_of(solution, "rotor_rates", "no rotor rates: its system is not a rigid body with rotors")
+    rates = _require_velocities(solution, "rotor_rates", "no rotor rates: its system is not a rigid body with rotors")
     return np.rad2deg(rates) if degrees else rates
 
 
-def _velocities_of(solution: AuditableResult, name: str, absence: str) -> np.ndarray:
-    """Return the velocities of a name at the states of a result; raise InputError, with ``absence``, without any."""
+def _require_velocities(solution: AuditableResult, velocity_name: str, absence_message: str) -> np.ndarray:
+    """Return velocities at the saved states of a result; raise InputError with ``absence_message`` if it has none."""
     if solution.x is None:
         raise InputError('no states were kept: run the ensemble with outputs="final" or "trajectory"')
-    if name not in solution.velocity_sources:
-        raise InputError(f"the result has {absence}")
-    return solution.velocity_sources[name]()
+    if velocity_name not in solution.velocity_sources:
+        raise InputError(f"the result has {absence_message}")
+    return solution.velocity_sources[velocity_name]()
 
 
 def joint_rates(solution: AuditableResult) -> dict[str, np.ndarray]:
-    """Return the rates of the joint coordinates by the name of the body, beside ``solution.joints``.
+    """Return the rates of the joint coordinates by the name of the body, with the keys of ``solution.joints``.
 
     Parameters
     ----------
@@ -222,15 +222,15 @@ def joint_rates(solution: AuditableResult) -> dict[str, np.ndarray]:
     >>> lt.bodies.joint_rates(solution)["wheel"].round(12).tolist()
     [0.2, 0.2, 0.2]
     """
-    rates = _velocities_of(solution, "joint_rates", "no joint rates: its system is not a tree of jointed bodies")
-    first = min(start for start, _ in solution.provenance["joints"].values())
-    return solution.split_by_joint(rates, first)
+    rates = _require_velocities(solution, "joint_rates", "no joint rates: its system is not a tree of jointed bodies")
+    first_state_index = min(start for start, _ in solution.provenance["joints"].values())
+    return solution.split_by_joint(rates, first_state_index)
 
 
 def angular_momentum(solution: AuditableResult, frame: Literal["body", "space"] = "body") -> np.ndarray:
-    """Return the angular momentum of a body with all that it carries, whose state begins with it.
+    """Return the total angular momentum of a body and its internal parts.
 
-    In space it is constant, unless a torque acts from outside.
+    Its components in space are constant, unless a torque acts from outside.
 
     Parameters
     ----------
@@ -257,14 +257,14 @@ def angular_momentum(solution: AuditableResult, frame: Literal["body", "space"] 
     >>> np.allclose(momentum, momentum[0], atol=1e-14)
     True
     """
-    return _vectors_in_frame(solution, _momenta(solution), frame)
+    return _vectors_in_frame(solution, _require_angular_momenta(solution), frame)
 
 
 def _vectors_in_frame(solution: AuditableResult, vectors: np.ndarray, frame: str) -> np.ndarray:
-    """Return vectors in body axes, shape (..., 3), in axes of the body or fixed in space."""
+    """Return the components of vectors, given in body axes, shape (..., 3), in axes of the body or fixed in space."""
     if frame not in ("body", "space"):
         raise InputError(f"frame must be 'body' or 'space', got {frame!r}")
-    return vectors if frame == "body" else np.einsum("...ij,...j->...i", _attitudes(solution), vectors)
+    return vectors if frame == "body" else np.einsum("...ij,...j->...i", _require_rotation_matrices(solution), vectors)
 
 
 def nutation(solution: AuditableResult, axis=None, degrees: bool = False) -> np.ndarray:
@@ -300,7 +300,7 @@ def nutation(solution: AuditableResult, axis=None, degrees: bool = False) -> np.
     >>> bool(angle[0] > 1.0), bool(min(angle[-1], 3.1416 - angle[-1]) < 0.1)
     (True, True)
     """
-    mu, (a, b, e) = _momenta(solution), _body_frame(solution, axis)
+    mu, (a, b, e) = _require_angular_momenta(solution), _body_frame(solution, axis)
     angles = np.arctan2(np.hypot(mu @ a, mu @ b), mu @ e)
     return np.rad2deg(angles) if degrees else angles
 
@@ -327,7 +327,7 @@ def spin(solution: AuditableResult, axis=None) -> np.ndarray:
     InputError
         As for :func:`nutation`.
     """
-    mu, (a, b, _) = _momenta(solution), _body_frame(solution, axis)
+    mu, (a, b, _) = _require_angular_momenta(solution), _body_frame(solution, axis)
     return _unwrap_in_time(solution, np.arctan2(mu @ a, mu @ b))
 
 
@@ -352,7 +352,7 @@ def precession(solution: AuditableResult, axis=None) -> np.ndarray:
     InputError
         As for :func:`nutation`, and if there are no attitudes.
     """
-    g, mu, e = _attitudes(solution), _momenta(solution), _body_frame(solution, axis)[2]
+    g, mu, e = _require_rotation_matrices(solution), _require_angular_momenta(solution), _body_frame(solution, axis)[2]
     L = np.einsum("...ij,...j->...i", g, mu)
     if _is_time_series(solution):
         L = L[..., :1, :]
@@ -372,23 +372,26 @@ def orientation_and_velocity_variables(solution: AuditableResult, dims: tuple[st
     """
     variables = {
         name: ((*dims, "quaternion_component")[: values.ndim], values)
-        for name, values in orientation_series(solution).items()
+        for name, values in orientation_series_by_name(solution).items()
     }
     velocities = {} if solution.x is None else solution.velocities()
     return variables | {name: ((*dims, VELOCITY_AXES[name]), values) for name, values in velocities.items()}
 
 
-def orientation_series(solution: AuditableResult) -> dict[str, np.ndarray]:
-    """Return all known series of the orientation of a body by name; empty without attitudes in SO(3)."""
+def orientation_series_by_name(solution: AuditableResult) -> dict[str, np.ndarray]:
+    """Return quaternions and, if the inertia is known, nutation, precession and spin of a run by name.
+
+    The result is empty without attitudes in SO(3).
+    """
     if solution.attitude is None or solution.provenance.get("group") != "SO(3)":
         return {}
     series = {"quaternion": quaternions(solution)}
-    if _inertia(solution) is not None:
+    if _inertia_or_none(solution) is not None:
         series |= {"nutation": nutation(solution), "precession": precession(solution), "spin": spin(solution)}
     return series
 
 
-def _attitudes(solution: AuditableResult) -> np.ndarray:
+def _require_rotation_matrices(solution: AuditableResult) -> np.ndarray:
     if not isinstance(solution, AuditableResult):
         raise InputError(f"attitudes need a solution or an ensemble, got {solution!r:.60}")
     if solution.attitude is None:
@@ -401,7 +404,7 @@ def _attitudes(solution: AuditableResult) -> np.ndarray:
     return solution.attitude[..., :3, :3]
 
 
-def _momenta(solution: AuditableResult) -> np.ndarray:
+def _require_angular_momenta(solution: AuditableResult) -> np.ndarray:
     if solution.x is None:
         raise InputError('no states were kept: run the ensemble with outputs="final" or "trajectory"')
     if not str(solution.provenance.get("algebra", "")).startswith("so(3)"):
@@ -412,15 +415,15 @@ def _momenta(solution: AuditableResult) -> np.ndarray:
     return solution.x[..., :3]
 
 
-def _inertia(solution: AuditableResult) -> np.ndarray | None:
+def _inertia_or_none(solution: AuditableResult) -> np.ndarray | None:
     inertia = solution.provenance.get("inertia")
     return None if inertia is None else np.array(inertia, dtype=float)
 
 
 def _body_frame(solution: AuditableResult, axis) -> np.ndarray:
-    """Return right-handed body axes as rows, shape (3, 3); the last is the axis that angles refer to."""
+    """Return right-handed body axes as rows, shape (3, 3), of which the last is ``axis`` or an axis of inertia."""
     if axis is None:
-        inertia = _inertia(solution)
+        inertia = _inertia_or_none(solution)
         if inertia is None:
             raise InputError(
                 "the axis of greatest inertia is unknown, because the energy is not quadratic in the momentum or the "
@@ -441,7 +444,10 @@ def _body_frame(solution: AuditableResult, axis) -> np.ndarray:
 
 
 def _orthogonal_pair(e) -> tuple[np.ndarray, np.ndarray]:
-    """Return two unit vectors, shape (..., 3), that complete e to a right-handed frame; cyclic for e_1, e_2 and e_3."""
+    """Return two unit vectors a, b, shape (..., 3), such that (a, b, e) is a right-handed frame.
+
+    For e = e_1, e_2 or e_3 they are the next two basis vectors in cyclic order.
+    """
     norm = np.linalg.norm(e, axis=-1, keepdims=True)
     e = np.divide(e, norm, where=norm > 0.0, out=np.zeros_like(e))
     start = np.eye(3)[(np.argmax(np.abs(e), axis=-1) + 1) % 3]
@@ -451,7 +457,7 @@ def _orthogonal_pair(e) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _is_time_series(solution: AuditableResult) -> bool:
-    """Return whether the last axis of the series is time, and not the trajectories of an ensemble of final states."""
+    """Return whether the last axis of the series is time; in an ensemble of final states it is the trajectory."""
     return solution.energy.shape[-1:] == np.shape(solution.t)
 
 

@@ -37,7 +37,7 @@ class RoundingScale:
     def from_series(
         cls, values: np.ndarray, sensitivity: float | None = None, term_size: float | None = None
     ) -> RoundingScale:
-        """Return the scale of a function with these values along a run, of which the first counts.
+        """Return the rounding scale of a function from its values along a run; ``value`` is the first.
 
         The largest value replaces an unknown sensitivity.
         """
@@ -46,7 +46,7 @@ class RoundingScale:
 
     @property
     def scale(self) -> Any:
-        """Scale relative to which changes of the function are given."""
+        """Scale that changes of the function are divided by: the larger of value and sensitivity; 1 if both are 0."""
         magnitude = np.maximum(np.abs(self.value), self.sensitivity)
         return np.where(magnitude > 0.0, magnitude, 1.0)
 
@@ -56,14 +56,14 @@ class RoundingScale:
         with np.errstate(invalid="ignore"):  # after an overflow the fraction is 1
             fractions = (np.where(np.isinf(self.scale), 1.0, part_scale / self.scale) for part_scale in scales)
             return sum(
-                fraction * allowed
-                for fraction, allowed in zip(fractions, (tolerance, VALUE_ROUNDING_RTOL), strict=True)
+                fraction * allowed_part
+                for fraction, allowed_part in zip(fractions, (tolerance, VALUE_ROUNDING_RTOL), strict=True)
             )
 
 
 @dataclass(frozen=True)
 class InvariantDrift:
-    """Change along a trajectory of a function that is conserved.
+    """Change of a conserved function along a trajectory, relative to its rounding scale.
 
     Attributes
     ----------

@@ -14,14 +14,14 @@ from manifolds._tables import html_grid
 
 from ..errors import ConvergenceError, InputError
 from .audit import Audit, Tolerances, audit_run
-from .audit_evidence import AuditableResult, Evidence, copies_of_velocities
+from .audit_evidence import AuditableResult, Evidence, velocity_copy_functions
 from .events import Events
 from .netcdf import (
     SOLUTION_FORMAT,
-    array_of_shape,
     build_dataset,
     dataclass_from_json,
     join_complex,
+    numeric_array_of_shape,
     split_complex,
     state_axis_names,
 )
@@ -49,7 +49,7 @@ class DenseOutput:
     step_ends : function from states, shape (m, n), and step sizes, shape (m,), to states
         Returns NaN for a step that fails.
     to_user_state : function from states, shape (m, n), to states
-        Converts internal states to those that the user sees.
+        Converts internal states to the user's form.
     """
 
     t: np.ndarray
@@ -69,22 +69,22 @@ class DenseOutput:
         inside_steps = np.flatnonzero(h > 0.0)
         if inside_steps.size:
             x[inside_steps] = self.step_ends(x[inside_steps], h[inside_steps])
-            self._check_solved(times[inside_steps], x[inside_steps])
+            self._raise_if_unsolved(times[inside_steps], x[inside_steps])
         x = self.to_user_state(x)
         return x.reshape(*t.shape, x.shape[-1])
 
-    def _check_solved(self, t: np.ndarray, x: np.ndarray) -> None:
-        """Raise if a partial step failed, although the run has taken the full step."""
-        is_unknown = np.isnan(x).any(axis=1)
+    def _raise_if_unsolved(self, times: np.ndarray, states: np.ndarray) -> None:
+        """Raise ConvergenceError if a partial step failed and its state is NaN."""
+        is_unknown = np.isnan(states).any(axis=1)
         if is_unknown.any():
             raise ConvergenceError(
-                f"the state at t = {t[is_unknown][0]:g}, between two steps, cannot be found: the equations of a "
+                f"the state at t = {times[is_unknown][0]:g}, between two steps, cannot be found: the equations of a "
                 "partial step were not solved. Evaluate the solution at the ends of the steps, or take smaller steps",
                 None,
             )
 
     def with_output_map(self, output_map: Callable[[np.ndarray], np.ndarray]) -> DenseOutput:
-        """Return this dense output with ``output_map`` applied to the states that the user sees."""
+        """Return a dense output that applies ``output_map`` to the states which this one returns."""
         previous_map = self.to_user_state
         return replace(self, to_user_state=lambda x: np.asarray(output_map(previous_map(x))))
 
@@ -103,7 +103,7 @@ CURVE_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9
 
 
 def svg_sketch(t: np.ndarray, series: np.ndarray, label: str) -> str:
-    """Draw curves over time in one frame, with a common scale.
+    """Return an SVG picture of curves over time in one frame, with a common scale.
 
     Parameters
     ----------
@@ -122,10 +122,10 @@ def svg_sketch(t: np.ndarray, series: np.ndarray, label: str) -> str:
     indices = np.unique(np.linspace(0, len(t) - 1, min(len(t), MAX_POINTS)).round().astype(int))
     t, series = t[indices], series[indices, :MAX_CURVES]
     finite_values = series[np.isfinite(series)]
-    lower, upper = (finite_values.min(), finite_values.max()) if finite_values.size else (0.0, 1.0)
-    value_range = (upper - lower) or 1.0
+    lowest_value, highest_value = (finite_values.min(), finite_values.max()) if finite_values.size else (0.0, 1.0)
+    value_range = (highest_value - lowest_value) or 1.0
     x_pixels = 4 + (width - 8) * (t - t[0]) / ((t[-1] - t[0]) or 1.0)
-    y_pixels = height - 4 - (height - 8) * (series - lower) / value_range
+    y_pixels = height - 4 - (height - 8) * (series - lowest_value) / value_range
     curves = "".join(
         f'<polyline fill="none" stroke="{colour}" stroke-width="1.3" points="'
         + " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(x_pixels, column, strict=True) if np.isfinite(y))
@@ -147,8 +147,8 @@ Class = TypeVar("Class", bound=type)
 
 
 @dataclass(frozen=True, eq=False)
-class Computation:
-    """Value of a deferred field that is not computed yet.
+class DeferredValue:
+    """Function without arguments that computes the value of a deferred field when the field is first read.
 
     Attributes
     ----------
@@ -160,12 +160,12 @@ class Computation:
 
 
 def defer(function: Callable[[], Any]) -> Any:
-    """Return a value for a deferred field: ``function()`` is called at the first use of the field."""
-    return Computation(function)
+    """Return a value for a deferred field, which calls ``function()`` when the field is first read."""
+    return DeferredValue(function)
 
 
 class _DeferredField:
-    """Descriptor of a field whose value may be a :class:`Computation`."""
+    """Descriptor of a field that computes a :class:`DeferredValue` when it is first read."""
 
     def __init__(self, name: str):
         self._name = name
@@ -174,7 +174,7 @@ class _DeferredField:
         if instance is None:
             return self
         value = vars(instance)[self._name]
-        if isinstance(value, Computation):
+        if isinstance(value, DeferredValue):
             value = vars(instance)[self._name] = value.function()
         return value
 
@@ -182,9 +182,8 @@ class _DeferredField:
         vars(instance)[self._name] = value
 
 
-def deferred_fields(*names: str) -> Callable[[Class], Class]:
-    """Decorate a dataclass so that the listed fields may hold a value of :func:`defer`, which is computed when it is
-    read."""
+def with_deferred_fields(*names: str) -> Callable[[Class], Class]:
+    """Return a class decorator that lets the named fields hold values of :func:`defer`, computed when first read."""
 
     def add_descriptors(cls: Class) -> Class:
         for name in names:
@@ -194,7 +193,7 @@ def deferred_fields(*names: str) -> Callable[[Class], Class]:
     return add_descriptors
 
 
-@deferred_fields("casimirs", "provenance")
+@with_deferred_fields("casimirs", "provenance")
 @dataclass(frozen=True)
 class Solution(AuditableResult):
     """The result of a run: times, states, energy, entropy and conserved quantities.
@@ -258,9 +257,9 @@ class Solution(AuditableResult):
 
     @with_library_settings
     def __call__(self, t) -> np.ndarray:
-        """Return the states at times t, shape (..., n): ends of steps that begin at the last state before.
+        """Return the states at times t, shape (..., n), each by a step from the last state before its time.
 
-        Such a state has the order of the method and obeys its laws.
+        These states have the order of the method and obey its laws.
 
         Raises
         ------
@@ -374,25 +373,27 @@ class Solution(AuditableResult):
         KeyError, TypeError or ValueError if a part is missing or does not fit.
         """
         json_data = {name: json.loads(attributes[name]) for name in ("status", "stats", "laws", "provenance")}
-        t, x = array_of_shape(series, "time", (None,)), series["x"]
+        t, x = numeric_array_of_shape(series, "time", (None,)), series["x"]
         if len(t) != int(attributes["times"]):
-            raise ValueError(f"{len(t)} times of {attributes['times']}")
+            raise ValueError(f"it has {len(t)} times, and {attributes['times']} were written")
         names = [str(name) for name in series["invariant_name"]]
-        entropy = array_of_shape(series, "entropy", (len(t),)) if "entropy" in series else None
+        entropy = numeric_array_of_shape(series, "entropy", (len(t),)) if "entropy" in series else None
         attitude = None
         if "attitude" in series:
             m = series["attitude"].shape[1:2]
-            attitude = join_complex(array_of_shape(series, "attitude", *((len(t), *m, *m, parts) for parts in (1, 2))))
+            attitude = join_complex(
+                numeric_array_of_shape(series, "attitude", *((len(t), *m, *m, parts) for parts in (1, 2)))
+            )
         event_time = json.loads(attributes.get("event_time", "null"))
         if not isinstance(event_time, int | float | None) or not isinstance(json_data["provenance"], dict):
             raise ValueError("its event_time is not a number, or its provenance is not a JSON object")
         evidence = dataclass_from_json(Evidence, json.loads(attributes.get("evidence", "{}")))
         return cls(
             t=t,
-            x=array_of_shape(series, "x", (len(t), *[None] * max(x.ndim - 1, 1))),
-            energy=array_of_shape(series, "energy", (len(t),)),
+            x=numeric_array_of_shape(series, "x", (len(t), *[None] * max(x.ndim - 1, 1))),
+            energy=numeric_array_of_shape(series, "energy", (len(t),)),
             entropy=entropy,
-            casimirs=dict(zip(names, array_of_shape(series, "invariant", (len(names), len(t))), strict=True)),
+            casimirs=dict(zip(names, numeric_array_of_shape(series, "invariant", (len(names), len(t))), strict=True)),
             status=dataclass_from_json(Status, json_data["status"]),
             stats=dataclass_from_json(Stats, json_data["stats"]),
             laws=dataclass_from_json(Laws, json_data["laws"]),
@@ -401,5 +402,5 @@ class Solution(AuditableResult):
             events=Events.from_dataset(series),
             attitude=attitude,
             evidence_source=lambda: evidence,
-            velocity_sources=copies_of_velocities(series),
+            velocity_sources=velocity_copy_functions(series),
         )

@@ -8,7 +8,7 @@ from ..engines.status_codes import STATUS_NAMES, StatusCode
 from ..errors import InputError
 
 OK_NAMES = tuple(STATUS_NAMES[code] for code in (StatusCode.COMPLETED, StatusCode.EVENT))
-"""Names of the status codes of runs that ended as they should."""
+"""Names of the status codes of runs that reached their end or an event that ends them."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Status:
 
 @dataclass(frozen=True)
 class Stats:
-    """Work of a run, and extremes over *all* steps, saved or not.
+    """Work counters of a run, and extreme values over *all* steps, saved or not.
 
     Attributes
     ----------

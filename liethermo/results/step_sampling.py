@@ -1,4 +1,4 @@
-"""Steps that an audit checks: all steps of a run, or those where the motion is fastest.
+"""Sample of the steps that an audit checks: all steps of a run, or the steps during the fastest motion.
 
 Each step is compared with the vector field at its ends and at points between, so that it cannot jump over a feature.
 """
@@ -26,7 +26,7 @@ MAX_FIELD_VALUES_PER_CALL = 200_000
 """Largest number of components in the states at which the field is evaluated in one call, to bound the memory."""
 
 MIN_SAMPLED_STEPS = 8
-"""Number of states, and of steps, that are checked at least, however large the system is."""
+"""Smallest number of states, and of steps, that are checked, even for a large system."""
 
 
 class StepSample(NamedTuple):
@@ -54,7 +54,11 @@ class StepSample(NamedTuple):
 
 
 def sample_steps_of_run(
-    system: System, saved_states: np.ndarray, saved_times: np.ndarray, step_sizes: np.ndarray, replay: Callable
+    system: System,
+    saved_states: np.ndarray,
+    saved_times: np.ndarray,
+    step_sizes: np.ndarray,
+    states_after_steps: Callable,
 ) -> StepSample:
     """Return a sample of the steps of a single run: all, or if these are too many, those with the fastest motion.
 
@@ -64,7 +68,7 @@ def sample_steps_of_run(
     saved_times : array, shape (times,)
     step_sizes : array, shape (times - 1,)
         Size of the steps from each saved time to the next.
-    replay : function of (x, h, steps) to an array, shape (at most steps, n)
+    states_after_steps : function of (x, h, steps) to an array, shape (at most steps, n)
         Returns the states after repeated steps.
     """
     gaps = np.diff(saved_times)
@@ -93,7 +97,7 @@ def sample_steps_of_run(
             states = np.vstack(
                 [
                     saved_states[i],
-                    replay(saved_states[i], step_sizes[i], min(counts[i], -(-budget // REPLAY_COST_RATIO))),
+                    states_after_steps(saved_states[i], step_sizes[i], min(counts[i], -(-budget // REPLAY_COST_RATIO))),
                 ]
             )
         numbers = np.arange(len(states) - 1)
@@ -105,27 +109,33 @@ def sample_steps_of_run(
     return StepSample(*(np.concatenate(arrays) for arrays in zip(*samples, strict=True)))
 
 
-def _order_by_field_change(system: System, x: np.ndarray, h: np.ndarray, max_states: int) -> np.ndarray:
-    """Return the indices of all steps, by decreasing change of the field, evaluated at ``max_states`` states."""
-    indices = np.unique(np.linspace(0, len(h) - 1, min(max_states, len(h))).astype(int))
-    field = vector_field_at(system, x[indices])
-    step = h[indices, None] * field
-    change = np.abs(h[indices, None] * vector_field_at(system, x[indices] + 0.5 * step) - step).max(axis=1)
+def _order_by_field_change(system: System, states: np.ndarray, step_sizes: np.ndarray, max_states: int) -> np.ndarray:
+    """Return the indices of all steps in the order of decreasing change of the vector field within a step.
+
+    The change is evaluated at ``max_states`` evenly spaced states at most.
+    """
+    indices = np.unique(np.linspace(0, len(step_sizes) - 1, min(max_states, len(step_sizes))).astype(int))
+    field = vector_field_at(system, states[indices])
+    step = step_sizes[indices, None] * field
+    change = np.abs(step_sizes[indices, None] * vector_field_at(system, states[indices] + 0.5 * step) - step).max(
+        axis=1
+    )
     change = np.nan_to_num(change, nan=np.inf)
     interval_change = np.maximum(change, np.append(change[1:], 0.0))  # for the interval between two sampled states
-    interval = np.searchsorted(indices, np.arange(len(h)), side="right") - 1
-    return np.lexsort([np.arange(len(h)), -interval_change[interval]])
+    interval = np.searchsorted(indices, np.arange(len(step_sizes)), side="right") - 1
+    return np.lexsort([np.arange(len(step_sizes)), -interval_change[interval]])
 
 
-def hermite_defect(field: Callable, steps: StepSample) -> np.ndarray:
-    """Return how far the slope of each step's cubic Hermite interpolant is from the field, relative to it, shape (m,).
+def hermite_defects(vector_field: Callable, steps: StepSample) -> np.ndarray:
+    """Return the defect of the cubic Hermite interpolant of each step, shape (m,), in units of the state.
 
-    This defect is the mean over points inside the step, times the step size: about the local error of a method of order
-    three. It serves to rank steps. Points where the field is not finite do not decide.
+    The defect is the mean distance between the slope of the interpolant and the vector field at points inside the step,
+    times the step size. It is about the local error of a method of order three, and serves to rank steps. Points where
+    the field is NaN count as zero.
 
     Parameters
     ----------
-    field : function of trajectories, shape (steps,), and states, shape (steps, q, n), to an array of that shape
+    vector_field : function of trajectories, shape (steps,), and states, shape (steps, q, n), to an array of that shape
         The vector field.
     """
     n_steps, n = steps.x.shape
@@ -150,20 +160,21 @@ def hermite_defect(field: Callable, steps: StepSample) -> np.ndarray:
         trajectory, _, sizes, x, x_end = steps.select(indices)
         h = sizes[:, None]
         ends = np.stack([x, x_end], axis=1)
-        slopes = h[:, None] * field(trajectory, ends)
-        data = [v[:, i : i + 1] for i in (0, 1) for v in (ends, slopes)]
-        cubic_states = sum(c * v for c, v in zip(value_weights, data, strict=True))
+        slopes = h[:, None] * vector_field(trajectory, ends)
+        ends_and_slopes = [v[:, i : i + 1] for i in (0, 1) for v in (ends, slopes)]
+        cubic_states = sum(c * v for c, v in zip(value_weights, ends_and_slopes, strict=True))
         defect = np.abs(
-            h[:, None] * field(trajectory, cubic_states) - sum(c * v for c, v in zip(slope_weights, data, strict=True))
+            h[:, None] * vector_field(trajectory, cubic_states)
+            - sum(c * v for c, v in zip(slope_weights, ends_and_slopes, strict=True))
         ).max(axis=2)
         defects[indices] = np.nan_to_num(defect, nan=0.0, posinf=1e300).mean(axis=1)
     return defects
 
 
-def vector_field_at(system: System, x: np.ndarray) -> np.ndarray:
-    """Return the vector field at states, shape (m, n)."""
+def vector_field_at(system: System, states: np.ndarray) -> np.ndarray:
+    """Return the vector field of a system at each of several states, shape (m, n), as an array of this shape."""
     with np.errstate(all="ignore"):
-        return np.asarray(evaluate_at_points(vector_field, system, x))
+        return np.asarray(evaluate_at_points(vector_field, system, states))
 
 
 def vector_field(system: System, x):

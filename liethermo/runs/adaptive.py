@@ -19,11 +19,11 @@ MIN_STEP_FRACTION = 1e-14
 
 @dataclass(frozen=True)
 class Adaptive:
-    """Steps chosen by an estimate of the local error, so that errors add up to the tolerance.
+    """Adaptive step sizes, chosen so that the estimated errors of the steps add up to the tolerance.
 
     Take the time in which the state changes by its own size, at its greatest speed so far. In this time the estimated
-    errors of the steps add up to at most ``atol + rtol * max|x|``: a step that takes a fraction of this time may have
-    the same fraction of the error. So the error of a run is about proportional to the tolerance, with every method.
+    errors of the steps add up to at most ``atol + rtol * max|x|``: a step that spans a fraction f of this time is
+    allowed a fraction f of the error. So the error of a run is about proportional to the tolerance, with every method.
 
     Steps also resolve every growing deviation, however small it is, so that it grows at its rate to a few thousandths:
     a body spinning about its middle axis leaves that axis at the right time. The laws hold at every step.
@@ -65,7 +65,9 @@ class Adaptive:
             if not (isinstance(value, int | float) and math.isfinite(value) and value >= 0.0):
                 raise InputError(f"{name} must be a number >= 0, got {value!r}")
         if max(self.rtol, self.atol) == 0.0:
-            raise InputError("rtol and atol are both zero: no step is that exact")
+            raise InputError(
+                "rtol and atol are both zero, and one of them must be positive. Use, for example, rtol=1e-8"
+            )
         if self.atol == 0.0 and self.rtol < 1e-14:
             raise InputError(f"rtol = {self.rtol:g} is below the rounding of double precision. Use 1e-14 or more")
         for name in ("first", "largest"):
@@ -83,9 +85,9 @@ class Adaptive:
 
 
 def make_step_control(
-    step: float | Adaptive, method: OneStepMethod, length: float, events: EventSet | None
+    step: float | Adaptive, method: OneStepMethod, span_length: float, events: EventSet | None
 ) -> StepControl:
-    """Return the step control of a run over a span of some length, with the event functions that it monitors.
+    """Return the settings of adaptive or fixed steps in the form of the engines, with the monitored event functions.
 
     Raises
     ------
@@ -93,7 +95,7 @@ def make_step_control(
         If the method has no error estimate and so cannot take adaptive steps.
     """
     adaptive = isinstance(step, Adaptive)
-    min_step = MIN_STEP_FRACTION * length if math.isfinite(length) else 0.0
+    min_step = MIN_STEP_FRACTION * span_length if math.isfinite(span_length) else 0.0
     if isinstance(step, Adaptive):
         if not has_error_estimate(method):
             raise InputError(f"the steps of {method} cannot be adaptive: {method.why_fixed_step}")

@@ -17,9 +17,9 @@ from ..engines.status_codes import StatusCode
 from ..engines.step import State
 from ..engines.step_control import StepControl
 from ..tracing.scalarize import UnsupportedPrimitive
-from .driver import drive_adaptive
+from .driver import advance_until_all_end
 from .events import EventSet
-from .termination import INTERRUPTING_ERRORS, interruption_reason
+from .termination import INTERRUPTING_ERRORS, interruption_reason_or_reraise
 
 ATTEMPTS_PER_CALL = 64
 """Number of attempted steps between two checks of an adaptive run."""
@@ -65,7 +65,7 @@ class AdaptiveRun:
     adaptive_runs : AdaptiveRuns
         The trajectory at its start.
     control : StepControl
-    stops : array
+    stop_times : array
         Times at which steps must end, in increasing order; the last is the end of the span.
     step_callback : function of AcceptedSteps
         Called with all accepted steps, several at a time.
@@ -100,7 +100,7 @@ class AdaptiveRun:
         engine: EngineWithFallback,
         adaptive_runs: AdaptiveRuns,
         control: StepControl,
-        stops: np.ndarray,
+        stop_times: np.ndarray,
         step_callback: Callable[[AcceptedSteps], None],
         max_steps: float = MAX_STORED_VALUES,
         events: EventSet | None = None,
@@ -109,7 +109,9 @@ class AdaptiveRun:
         self.engine, self.control, self.step_callback, self.event_set = engine, control, step_callback, events
         self.runs, self.max_steps, self.attempts_per_call = adaptive_runs, max_steps, attempts_per_call
         rules = EventRules() if events is None else events.rules
-        self.pause_handler = PauseHandler(adaptive_runs, control, engine.method, stops, lambda i: engine.system, rules)
+        self.pause_handler = PauseHandler(
+            adaptive_runs, control, engine.method, stop_times, lambda i: engine.system, rules
+        )
         handler, self.n_event_steps = self.pause_handler, 0
         self.occurrences, self.sign_jumps = handler.occurrences, handler.sign_jumps
         self.undefined_ends, self.undefined_events = handler.undefined_ends, list[int]()
@@ -122,24 +124,24 @@ class AdaptiveRun:
     def advance_to_end(self) -> None:
         """Advance the run until its end, an event, a failure or Ctrl-C."""
         try:
-            drive_adaptive(self.pause_handler, self)
+            advance_until_all_end(self.pause_handler, self)
             self._record_failure()
         except INTERRUPTING_ERRORS as error:
-            self.interruption = interruption_reason(error)
+            self.interruption = interruption_reason_or_reraise(error)
 
-    def _scalar(self, name: str) -> float:
-        return float(self.runs.read(name)[0])
+    def _read_scalar(self, field_name: str) -> float:
+        return float(self.runs.read(field_name)[0])
 
-    def continues(self) -> bool:
-        if self._scalar("status") != StatusCode.COMPLETED:
+    def can_continue(self) -> bool:
+        if self._read_scalar("status") != StatusCode.COMPLETED:
             return False
         if int(self.state.step) >= self.max_steps:
             self.exhausted_limit = "memory"
             return False
         return True
 
-    def attempt(self) -> None:
-        first_step, t = int(self.state.step), self._scalar("t")
+    def attempt_steps(self) -> None:
+        first_step, t = int(self.state.step), self._read_scalar("t")
         try:
             max_attempts = self.attempts_per_call or ATTEMPTS_PER_CALL
             attempts = self.runs.record_attempts(int(min(max_attempts, max(1.0, self.max_steps - first_step))))
@@ -147,41 +149,41 @@ class AdaptiveRun:
             self.runs = self.engine.resume_adaptive_on_array_engine(error, self.control, self.runs)
             self.pause_handler.adaptive_runs = self.runs
             return
-        self.n_rejected = int(self._scalar("n_rejected"))
+        self.n_rejected = int(self._read_scalar("n_rejected"))
         self.state = _clear_pause_status(self.runs.state_of_only_trajectory())
         is_accepted = np.diff(attempts["step"], prepend=first_step) > 0
         if is_accepted.any():
             x, energy, entropy, step_counts, end_times, h = (attempts[name][is_accepted] for name in ATTEMPT_FIELDS)
-            ends_at_event = bool(self._scalar("status") == StatusCode.PAUSED_AT_EVENT and is_accepted[-1])
+            ends_at_event = bool(self._read_scalar("status") == StatusCode.PAUSED_AT_EVENT and is_accepted[-1])
             step_counts, times = step_counts - self.n_event_steps, np.append(t, end_times)
             self.n_event_steps += ends_at_event
             self.step_callback(AcceptedSteps(times, h, x, energy, entropy, step_counts, ends_at_event, self.state))
 
-    def record_pauses(self) -> None:
+    def handle_pauses(self) -> None:
         if self.event_set is not None:
             self.event_set.raise_first_error()
 
     def record_ended_trajectories(self) -> None:
         """Record the time of the event that ended the run, and the event functions that are undefined at its end."""
-        if self._scalar("status") == StatusCode.EVENT:
-            self.event_time = self._scalar("t")
+        if self._read_scalar("status") == StatusCode.EVENT:
+            self.event_time = self._read_scalar("t")
         if self.event_set is not None:
             is_undefined = ~np.isfinite(self.runs.read("event_values")[0])
             self.undefined_events = np.flatnonzero(is_undefined).tolist()
 
     def _record_failure(self) -> None:
         """If the run has stopped early, record why."""
-        code = int(self._scalar("status"))
+        code = int(self._read_scalar("status"))
         if code == StatusCode.STEP_LIMIT:
             self.exhausted_limit = "steps"
         elif code == StatusCode.STEP_UNDERFLOW:
-            self.underflow_step_size = self._scalar("next_step_size")
+            self.underflow_step_size = self._read_scalar("next_step_size")
             self.state = self.state._replace(
-                status=np.int64(self._scalar("last_attempt_status")), residual=self._scalar("residual")
+                status=np.int64(self._read_scalar("last_attempt_status")), residual=self._read_scalar("residual")
             )
         elif code not in (StatusCode.COMPLETED, StatusCode.EVENT, StatusCode.REACHED_END):
-            self.state = self.state._replace(status=np.int64(code), residual=self._scalar("residual"))
-            is_solved = self._scalar("last_attempt_status") == StatusCode.COMPLETED
+            self.state = self.state._replace(status=np.int64(code), residual=self._read_scalar("residual"))
+            is_solved = self._read_scalar("last_attempt_status") == StatusCode.COMPLETED
             self.exhausted_limit = "sight" if is_solved else ""
 
 

@@ -28,21 +28,21 @@ from .member_groups import common_inertia, group_members_by_invariants, members_
 from .noise import Fluctuations, NoisePaths, check_noise
 from .preparation import (
     check_choice,
-    check_steps,
     checked_or_default_method,
-    limit_family_to_span,
-    limit_to_span,
+    limit_time_functions_of_family,
+    limit_time_functions_to_span,
+    refuse_incompatible_options,
     refuse_tracers,
     why_not_startable,
-    wrap_family,
+    wrap_family_like_member,
 )
 from .problem import Problem
 from .progress import Progress
 from .record import EnsembleRecord, GroupRecord, TrajectoryGroup
 from .schedule import StepSchedule, make_schedule
 from .solution_builder import run_provenance
-from .system_family import Family, broadcast_size, error_message_of
-from .time_features import schedule_around_features
+from .system_family import Family, broadcast_size, error_message_or_empty
+from .time_features import add_breaks_at_features_or_warn
 
 __all__ = ["MAX_THREADS", "Ensemble", "ensemble"]
 
@@ -135,11 +135,11 @@ def ensemble(
         raise InputError(f'save_at needs outputs="trajectory", got {outputs!r}')
     if (isinstance(step, Adaptive) or until is not None) and outputs == "trajectory" and save_at is None:
         raise InputError('outputs="trajectory" with adaptive steps or events needs save_at, common times to save')
-    check_steps(method, step, noise, until)
+    refuse_incompatible_options(method, step, noise, until)
     family = Family.from_arguments(system, parameters)
     save_every_step = save_every if outputs == "trajectory" and save_at is None else None
-    declared = DeclaredTimes.from_tree(family.with_unknown_parameters())
-    schedule = make_schedule(t_span, step, save_every_step, save_at, breaks=breaks, declared=declared)
+    declared_times = DeclaredTimes.from_tree(family.member_with_unknown_parameters())
+    schedule = make_schedule(t_span, step, save_every_step, save_at, breaks=breaks, declared_times=declared_times)
     attitude = attitude_array(attitude, None)
     states, reasons = _checked_initial_states(family, x0s, len(attitude) if np.ndim(attitude) == 3 else 1)
     check_noise(noise, len(states))
@@ -176,12 +176,12 @@ def ensemble(
             options.run_group(group_record, functools.partial(_update_progress, bar, n_done))
             if group_record.is_interrupted:
                 break
-            n_done += len(group_record.numbers)
+            n_done += len(group_record.trajectory_numbers)
     return record.to_ensemble(reasons, provenance, wall_time=time.perf_counter() - start_time)
 
 
-def _update_progress(bar: Progress, n_done: int, n_more: float) -> None:
-    bar.update(n_done + n_more)
+def _update_progress(bar: Progress, n_in_earlier_groups: int, n_in_this_group: float) -> None:
+    bar.update(n_in_earlier_groups + n_in_this_group)
 
 
 class _EnsembleOptions(NamedTuple):
@@ -195,65 +195,82 @@ class _EnsembleOptions(NamedTuple):
     noise: Fluctuations | None
 
     def prepare_group(
-        self, family: Family, states: np.ndarray, numbers: np.ndarray, attitude
+        self, family: Family, initial_states: np.ndarray, trajectory_numbers: np.ndarray, attitude
     ) -> tuple[TrajectoryGroup | None, dict[int, str]]:
-        """Return a group of trajectories as it is run, or None if none can start, and why some cannot.
+        """Return a group of trajectories ready to run (None if none can start), and the reasons why some cannot start.
 
-        The reasons belong to trajectories by their numbers.
+        The keys of the reasons are the numbers of the trajectories.
 
         Parameters
         ----------
-        states : array, shape (B, n)
+        initial_states : array, shape (B, n)
             Initial states.
-        numbers : array of int, shape (B,)
+        trajectory_numbers : array of int, shape (B,)
             The numbers of the trajectories in the ensemble.
         attitude : array, shape (m, m) or (B, m, m), or None
         """
         step, schedule, noise = self.step, self.schedule, self.noise
         tolerance = step.tolerance if isinstance(step, Adaptive) else None
-        problem = Problem.from_user(family.member(0), self.method, noise, tolerance, states)
-        method, family = problem.method, wrap_family(family, problem.system)
-        states = np.asarray(problem.system.initial_state(states, schedule.start, attitude, batch=True))
-        family_in_span = limit_family_to_span(family, problem.system, schedule)
-        member = problem.system_in_span(schedule)
+        problem = Problem.from_user(family.member(0), self.method, noise, tolerance, initial_states)
+        method, family = problem.method, wrap_family_like_member(family, problem.system)
+        initial_states = np.asarray(problem.system.initial_state(initial_states, schedule.start, attitude, batch=True))
+        family_in_span = limit_time_functions_of_family(family, problem.system, schedule)
+        member = problem.system_limited_to_span(schedule)
         reasons = {
-            int(numbers[i]): text for i, text in _unstartable_members(family_in_span, member, method, states).items()
+            int(trajectory_numbers[i]): text
+            for i, text in _reasons_of_unstartable_members(family_in_span, member, method, initial_states).items()
         }
         if reasons:
-            startable = np.flatnonzero(~np.isin(numbers, list(reasons)))
-            numbers, family, states = numbers[startable], family.select(startable), states[startable]
-            if not len(numbers):
+            startable = np.flatnonzero(~np.isin(trajectory_numbers, list(reasons)))
+            trajectory_numbers, family, initial_states = (
+                trajectory_numbers[startable],
+                family.select(startable),
+                initial_states[startable],
+            )
+            if not len(trajectory_numbers):
                 return None, reasons
             family_in_span = family_in_span.select(startable)
         if problem.is_driven:
-            members = family.members_with_extreme_parameters()[: len(states)]
-            systems = [limit_to_span(family.member(i), schedule) for i in members]
-            schedule = schedule_around_features(schedule, systems, states[members], step)
+            members = family.members_with_extreme_parameters()[: len(initial_states)]
+            systems = [limit_time_functions_to_span(family.member(i), schedule) for i in members]
+            schedule = add_breaks_at_features_or_warn(schedule, systems, initial_states[members], step)
             if schedule is not self.schedule:
-                family_in_span = limit_family_to_span(family, problem.system, schedule)
-                member = problem.system_in_span(schedule)
-        events = None if self.until is None else EventSet(self.until, member, schedule.start, states[0])
+                family_in_span = limit_time_functions_of_family(family, problem.system, schedule)
+                member = problem.system_limited_to_span(schedule)
+        events = None if self.until is None else EventSet(self.until, member, schedule.start, initial_states[0])
         control = noise_paths = None
         if tolerance is not None or events is not None:
             control = make_step_control(step, method, schedule.end - schedule.start, events)
         if noise is not None and noise_dimension(method):
-            noise_paths = NoisePaths(noise, noise_dimension(method), numbers, schedule)
+            noise_paths = NoisePaths(noise, noise_dimension(method), trajectory_numbers, schedule)
         h = schedule.h if tolerance is None else np.nan
         group = TrajectoryGroup(
-            numbers, problem, family_in_span, member, states, schedule, h, control, events, noise_paths
+            trajectory_numbers,
+            problem,
+            family_in_span,
+            member,
+            initial_states,
+            schedule,
+            h,
+            control,
+            events,
+            noise_paths,
         )
         return group, reasons
 
-    def run_group(self, record: GroupRecord, report: Callable[[float], None]) -> None:
-        """Run a group of trajectories; ``report`` is called with the number of finished ones."""
+    def run_group(self, group_record: GroupRecord, report_n_finished: Callable[[float], None]) -> None:
+        """Run a group of trajectories and fill its record.
+
+        ``report_n_finished`` is called with the number of finished trajectories whenever it changes.
+        """
 
         def run_with_engine(engine: str) -> None:
-            record.engine = engine
+            group_record.engine = engine
             run_class = FixedEnsembleRun if group.control is None else AdaptiveEnsembleRun
-            run = run_class(record, ProgressCounter(report))
-            (run.run_compiled if engine == "compiled" else run.run_array)()
+            run = run_class(group_record, ProgressCounter(report_n_finished))
+            (run.run_on_compiled_engine if engine == "compiled" else run.run_on_array_engine)()
 
-        group = record.group
+        group = group_record.group
         calls_python = group.events is not None and group.events.calls_python
         is_worthwhile = not calls_python and is_worth_compiling(group.member, group.method)
         prefers_compiled = self.engine == "auto" and is_worthwhile
@@ -282,7 +299,7 @@ def _checked_initial_states(family: Family, x0s, n_attitudes: int) -> tuple[np.n
     member = family.example
     if member is None:
         member = family.member(next(i for i in range(family.size) if i not in family.refusal_reasons))
-    x0s, x0_reasons = _convert_initial_states(member, x0s)
+    x0s, x0_reasons = _convert_or_replace_initial_states(member, x0s)
     if x0s.ndim > 2:
         raise InputError(f"initial states must have shape (n,) or (trajectories, n), got {x0s.shape}")
     n_trajectories = broadcast_size(len(x0s), family.size, n_attitudes)
@@ -291,56 +308,60 @@ def _checked_initial_states(family: Family, x0s, n_attitudes: int) -> tuple[np.n
         raise InputError(x0_reasons[0])
     reasons = dict(family.refusal_reasons) | x0_reasons
     if family.size > 1 and family.example is None:
-        reasons = family.rejection_reasons(lambda i: family.axiom_violation_text(i, states[i]), reasons)
+        reasons = family.find_rejection_reasons(lambda i: family.axiom_violation_text(i, states[i]), reasons)
     if len(reasons) == n_trajectories:
         raise InputError(f"no trajectory can be started; trajectory 0: {reasons[0]}")
     return states, reasons
 
 
-def _unstartable_members(family: Family, member: System, method: OneStepMethod, states: np.ndarray) -> dict[int, str]:
-    """Return the prepared trajectories that the method cannot start at their initial states, with the reasons."""
-    reasons = _bisect_invalid_rows(lambda rows: why_not_startable(member, method, states[rows]), len(states))
+def _reasons_of_unstartable_members(
+    family: Family, example_system: System, method: OneStepMethod, initial_states: np.ndarray
+) -> dict[int, str]:
+    """Return the reasons why the method cannot start some members at their initial states, by member index."""
+    reasons = _find_invalid_rows_by_bisection(
+        lambda rows: why_not_startable(example_system, method, initial_states[rows]), len(initial_states)
+    )
     if not any(family.has_member_axis):
         return reasons
-    suspects = {*reasons, *family.members_with_extreme_parameters(), *members_outside_domain(family, states)}
-    member_reasons = {i: why_not_startable(family.member(i), method, states[i]) for i in sorted(suspects)}
+    suspects = {*reasons, *family.members_with_extreme_parameters(), *members_outside_domain(family, initial_states)}
+    member_reasons = {i: why_not_startable(family.member(i), method, initial_states[i]) for i in sorted(suspects)}
     return {i: text for i, text in member_reasons.items() if text}
 
 
-def _bisect_invalid_rows(why_invalid: Callable[[slice], str], n_rows: int) -> dict[int, str]:
-    """Return the rows for which ``why_invalid`` gives a reason, located by bisection of slices."""
+def _find_invalid_rows_by_bisection(error_of_rows: Callable[[slice], str], n_rows: int) -> dict[int, str]:
+    """Return the error texts of invalid rows, by row index, found by bisection of the slices that have an error."""
     reasons: dict[int, str] = {}
 
-    def search_rows(start: int, stop: int) -> None:
-        text = why_invalid(slice(start, stop))
+    def bisect_rows(start: int, stop: int) -> None:
+        text = error_of_rows(slice(start, stop))
         if text and stop - start == 1:
             reasons[start] = text
         elif text:
-            search_rows(start, (start + stop) // 2)
-            search_rows((start + stop) // 2, stop)
+            bisect_rows(start, (start + stop) // 2)
+            bisect_rows((start + stop) // 2, stop)
 
     for batch_start in range(0, n_rows, DOMAIN_CHECK_BATCH_SIZE):
-        search_rows(batch_start, min(batch_start + DOMAIN_CHECK_BATCH_SIZE, n_rows))
+        bisect_rows(batch_start, min(batch_start + DOMAIN_CHECK_BATCH_SIZE, n_rows))
     return reasons
 
 
-def _convert_initial_states(member: System, x0s) -> tuple[np.ndarray, dict[int, str]]:
-    """Return initial states, shape (trajectories, n), and the invalid rows of x0s with the reasons.
+def _convert_or_replace_initial_states(example_system: System, x0s) -> tuple[np.ndarray, dict[int, str]]:
+    """Return initial states, shape (trajectories, n), and the errors of the invalid rows of x0s, by row index.
 
-    An invalid row is replaced by a valid one.
+    Invalid rows are replaced by a valid one.
     """
     try:
-        return np.atleast_2d(np.asarray(member.state_array(x0s, batch=True))), {}
+        return np.atleast_2d(np.asarray(example_system.state_array(x0s, batch=True))), {}
     except (InputError, ValueError):
         rows = np.asarray(x0s)
         if rows.ndim < 2 or rows.dtype.kind not in "fiubc" or not len(rows):
             raise
-    reasons = _bisect_invalid_rows(
-        lambda batch: error_message_of(lambda: member.state_array(rows[batch], batch=True)), len(rows)
+    reasons = _find_invalid_rows_by_bisection(
+        lambda batch: error_message_or_empty(lambda: example_system.state_array(rows[batch], batch=True)), len(rows)
     )
     valid_rows = [i for i in range(len(rows)) if i not in reasons]
     if not valid_rows:
         raise InputError(f"no trajectory can be started; trajectory 0: {reasons[0]}")
     valid_x0s = rows.copy()
     valid_x0s[list(reasons)] = rows[valid_rows[0]]
-    return np.asarray(member.state_array(valid_x0s, batch=True)), reasons
+    return np.asarray(example_system.state_array(valid_x0s, batch=True)), reasons

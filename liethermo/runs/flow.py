@@ -33,83 +33,92 @@ from ..errors import InputError
 from ..functions.time_span import DeclaredTimes
 from ..integrators import OneStepMethod
 from ..systems import System
-from ..systems.clock import system_of_step
+from ..systems.clock import system_between_breaks
 from ..systems.kind_checks import require_system
 from ..tracing.programs import jit_cached, jit_unoptimised
 from .adaptive import Adaptive
-from .flow_derivatives import implicit_solution, state_derivatives
+from .flow_derivatives import solve_with_implicit_derivative, state_derivatives
 from .named_parameters import replace_parameters
 from .preparation import (
     checked_initial_state,
     checked_or_default_method,
-    limit_to_span,
+    limit_time_functions_to_span,
     prepare_for_method,
 )
 from .schedule import StepSchedule, clip_times_to_span, make_schedule
 
 
-def system_with_parameters(system, parameters) -> System:
-    """Return the system with other parameters: a function of them that builds it, or a system and a dict by name.
+def system_with_parameters(system_or_builder, parameters) -> System:
+    """Return the system with these parameters, set by name in a system or passed to a function that builds it.
 
     Raises
     ------
     InputError
-        If a name or a shape is not that of a parameter of the system.
+        If the system has no parameter of some name, or a value has another shape than the parameter.
     """
     if parameters is None:
-        return system
-    if not isinstance(system, System):
-        if not callable(system):
-            raise InputError(f"system must be a system, or a function of parameters=, got {type(system).__name__}")
-        return system(parameters)
+        return system_or_builder
+    if not isinstance(system_or_builder, System):
+        if not callable(system_or_builder):
+            raise InputError(
+                f"system must be a system, or a function of parameters=, got {type(system_or_builder).__name__}"
+            )
+        return system_or_builder(parameters)
     if not isinstance(parameters, Mapping):
         raise InputError(
             "parameters of a system must be a dict by the names of its parameters. For parameters of another form, "
             "give a function of them that builds the system"
         )
-    return replace_parameters(system, parameters)
+    return replace_parameters(system_or_builder, parameters)
 
 
 def checked_save_times(save_at, schedule: StepSchedule) -> jax.Array | np.ndarray:
-    """Return the times of ``save_at`` as an array, shape (times,); times that are traced are not checked."""
+    """Return the times of ``save_at`` as an array, shape (times,), after checking them unless they are traced."""
     times = jnp.asarray(save_at, dtype=jnp.float64) if is_traced(save_at) else np.asarray(save_at, dtype=np.float64)
     if times.ndim != 1 or not times.size:
         raise InputError(f"save_at must be a list of times, got an array of shape {times.shape}")
     if isinstance(times, jax.Array):
         return times
     if not np.isfinite(times).all():
-        raise InputError("save_at must be a list of finite times")
+        raise InputError(f"save_at must be a list of finite times, got {save_at!r:.60}")
     return clip_times_to_span(times, schedule.start, schedule.end, "save_at")
 
 
 def states_at_times(
-    system: System, method: OneStepMethod, path, grid, times, span: tuple[float, float], step: Callable
+    system: System,
+    method: OneStepMethod,
+    path_states,
+    path_times,
+    requested_times,
+    span: tuple[float, float],
+    step_function: Callable,
 ) -> jax.Array:
-    """Return the states at times, shape (times, n), each by one step from the last state of the path before its time.
+    """Return the states at the requested times, shape (times, n), each by one step from the last state before its time.
 
     Parameters
     ----------
-    path : array, shape (steps + 1, n)
-        The states at the ends of steps.
-    grid : array, shape (steps + 1,)
-        Their times.
-    times : array, shape (times,)
+    path_states : array, shape (steps + 1, n)
+        The initial state and the states at the ends of steps.
+    path_times : array, shape (steps + 1,)
+        The times of these states.
+    requested_times : array, shape (times,)
     span : (float, float)
         Start and end of the run; the state at a time outside of it is NaN.
-    step : function from the system, the method, a state and a step size to a state
+    step_function : function of (system, method, state, step size)
+        Returns the next state.
     """
     start, end = span
-    is_inside = (times >= start) & (times <= end)
+    is_inside = (requested_times >= start) & (requested_times <= end)
     # The step has a length h > 0 where it can, for its derivative by h: the last state strictly before the time.
-    index = jnp.clip(jnp.searchsorted(grid, times, side="left") - 1, 0, len(grid) - 2)
+    index = jnp.clip(jnp.searchsorted(path_times, requested_times, side="left") - 1, 0, len(path_times) - 2)
 
     def end_state(x, h):
         # A step of size zero, at the start of the run, divides by zero; its derivative by the time is the velocity.
         is_zero = h == 0.0
-        moved = step(system, method, x, jnp.where(is_zero, grid[1] - grid[0], h))
-        return jnp.where(is_zero, x + h * system._vector_field(x), moved)
+        next_state = step_function(system, method, x, jnp.where(is_zero, path_times[1] - path_times[0], h))
+        return jnp.where(is_zero, x + h * system._vector_field(x), next_state)
 
-    states = jax.vmap(end_state)(path[index], times - grid[index])
+    states = jax.vmap(end_state)(path_states[index], requested_times - path_times[index])
     return jnp.where(is_inside[:, None], states, jnp.nan)
 
 
@@ -198,16 +207,16 @@ def flow(
     """
     method = checked_or_default_method(method)
     system = system_with_parameters(system, parameters)
-    _check_arguments(system, t_span, step)
+    _check_fixed_step_arguments(system, t_span, step)
     if save_at is not None and save_every is not None:
         raise InputError("flow takes save_at or save_every, got both. Remove one of them")
     save_every = 1 if save_at is not None else save_every
-    x, declared = system.state(x0), DeclaredTimes.from_tree(system)
-    schedule = make_schedule(t_span, step, save_every, breaks=breaks, declared=declared)
+    x, declared_times = system.state(x0), DeclaredTimes.from_tree(system)
+    schedule = make_schedule(t_span, step, save_every, breaks=breaks, declared_times=declared_times)
     times = None if save_at is None else checked_save_times(save_at, schedule)
     n, user_system = system.dim, system
     system, method = prepare_for_method(system, method, None, attitude is not None)
-    system = limit_to_span(system, schedule)
+    system = limit_time_functions_to_span(system, schedule)
     initial_arguments = x, schedule.start, attitude
     # the values of a traced state are unknown, so it cannot be checked
     x = jnp.asarray(
@@ -221,38 +230,46 @@ def flow(
         tuple((n_saves, steps_per_save) for _, n_saves, steps_per_save, _ in calls),
     )
     # Derivatives need solved slopes only. So a program without derivatives runs the iterations.
-    arguments, final_only = (system, method, x), save_every is None
-    is_differentiated = not method.explicit and is_traced(arguments)
-    values = _stop_gradients(arguments) if is_differentiated else arguments
-    newton = method.explicit or is_traced(values)
+    system_method_state, final_only = (system, method, x), save_every is None
+    is_differentiated = not method.explicit and is_traced(system_method_state)
+    stopped_arguments = _stop_gradients(system_method_state) if is_differentiated else system_method_state
+    uses_newton = method.explicit or is_traced(stopped_arguments)
     compile_program = jit_unoptimised if schedule.n_steps * x.size <= MAX_UNOPTIMISED_WORK else jit_cached
-    path, steps = compile_program(_compute_path)(values, step_sizes, save_counts, newton, is_differentiated, final_only)
-    if not newton and not np.isfinite(np.asarray(path)[-1]).all():  # compile Newton's method only if a step needs it
-        path, steps = compile_program(_compute_path)(
-            values, step_sizes, save_counts, True, is_differentiated, final_only
+    path, solved_steps = compile_program(_integrate_path)(
+        stopped_arguments, step_sizes, save_counts, uses_newton, is_differentiated, final_only
+    )
+    if (
+        not uses_newton and not np.isfinite(np.asarray(path)[-1]).all()
+    ):  # compile Newton's method only if a step needs it
+        path, solved_steps = compile_program(_integrate_path)(
+            stopped_arguments, step_sizes, save_counts, True, is_differentiated, final_only
         )
     if is_differentiated:
-        leaves = jax.tree_util.tree_leaves(arguments)
+        leaves = jax.tree_util.tree_leaves(system_method_state)
         leaf_is_traced, traced_leaves = tuple(map(is_traced, leaves)), [leaf for leaf in leaves if is_traced(leaf)]
         order = _differentiation_order(traced_leaves)
         n_directions = sum(leaf.size for leaf in traced_leaves)
         if order and n_directions <= MAX_FORWARD_DIRECTIONS and n_directions**order <= MAX_FORWARD_DERIVATIVES:
             derivatives = _saved_path_derivatives(
-                values, leaf_is_traced, order, step_sizes, save_counts, steps, final_only
+                stopped_arguments, leaf_is_traced, order, step_sizes, save_counts, solved_steps, final_only
             )
             path = jit_cached(_attach_derivatives)(path, derivatives, traced_leaves, _stop_gradients(traced_leaves))
         else:
-            path = jit_cached(_recompute_path)(*arguments, step_sizes, steps, final_only)
+            path = jit_cached(_differentiable_path_from_solved_steps)(
+                *system_method_state, step_sizes, solved_steps, final_only
+            )
     if times is not None:
-        path = _path_at_times((system, method), path, schedule, times, compile_program)
+        path = _states_at_times_by_newton_if_needed((system, method), path, schedule, times, compile_program)
     path = path if path.shape[-1] == n else path[..., :n]
     return user_system.points(path) if user_system.space is None else path
 
 
-def _path_at_times(system_and_method, path, schedule: StepSchedule, times, compile_program: Callable) -> jax.Array:
-    """Return states at given times, shape (times, n), from those at the ends of steps; by Newton's method if needed."""
-    arguments = *system_and_method, path, schedule.saved_times, times
-    span, program = (schedule.start, schedule.end), compile_program(_states_at_times)
+def _states_at_times_by_newton_if_needed(
+    system_and_method, path_states, schedule: StepSchedule, requested_times, compile_program: Callable
+) -> jax.Array:
+    """Return the states at the requested times, shape (times, n); steps that do not converge use Newton's method."""
+    arguments = *system_and_method, path_states, schedule.saved_times, requested_times
+    span, program = (schedule.start, schedule.end), compile_program(_solve_states_at_times)
     if system_and_method[1].explicit or is_traced(arguments):
         return program(*arguments, span, True)
     states = program(*arguments, span, False)
@@ -261,17 +278,19 @@ def _path_at_times(system_and_method, path, schedule: StepSchedule, times, compi
     return program(*arguments, span, True)
 
 
-def _states_at_times(system, method, path, grid, times, span: tuple[float, float], newton: bool) -> jax.Array:
-    solve = solve_or_nan if newton else fixed_point_or_nan
+def _solve_states_at_times(
+    system, method, path_states, path_times, requested_times, span: tuple[float, float], uses_newton: bool
+) -> jax.Array:
+    solve = solve_stages_or_nan if uses_newton else iterate_fixed_point_or_nan
 
     def end_state(system, method, x, h):
         return differentiable_step(system, method, initial_carry(system, method, x), h, solve)[0]
 
-    return states_at_times(system, method, path, grid, times, span, end_state)
+    return states_at_times(system, method, path_states, path_times, requested_times, span, end_state)
 
 
-def _check_arguments(system, t_span, step) -> None:
-    """Raise InputError if the arguments do not belong to a run with fixed steps."""
+def _check_fixed_step_arguments(system, t_span, step) -> None:
+    """Raise InputError unless the system is a System, the step is a number, and span and step are not traced."""
     require_system(system, "flow needs a system such as lt.models.rigid_body()")
     if isinstance(step, Adaptive):
         raise InputError("flow needs a fixed step, a number, got lt.Adaptive. For adaptive steps use lt.integrate")
@@ -295,14 +314,14 @@ MAX_FORWARD_DERIVATIVES = 256
 
 
 def _stop_gradients(tree: Any) -> Any:
-    """Return the pytree with its derivatives stopped."""
+    """Return the pytree with ``jax.lax.stop_gradient`` applied to its arrays."""
     return jax.tree_util.tree_map(lambda a: jax.lax.stop_gradient(a) if isinstance(a, jax.Array) else a, tree)
 
 
-def _differentiation_order(leaves: Sequence) -> int:
-    """Return how many times traced leaves with known values are differentiated; 0 if some value is unknown."""
+def _differentiation_order(traced_leaves: Sequence) -> int:
+    """Return the order of the derivatives that JAX takes by traced leaves; 0 if some leaf has no known value."""
     max_order = 0
-    for leaf in leaves:
+    for leaf in traced_leaves:
         leaf_order = 0
         while isinstance(leaf, jax.core.Tracer):
             if leaf.to_concrete_value() is None:
@@ -312,69 +331,75 @@ def _differentiation_order(leaves: Sequence) -> int:
     return max_order
 
 
-def _compute_path(
-    arguments: tuple[System, OneStepMethod, jax.Array],
+def _integrate_path(
+    system_method_state: tuple[System, OneStepMethod, jax.Array],
     step_sizes,
     save_counts: tuple[tuple[int, int], ...],
-    newton: bool,
+    uses_newton: bool,
     return_slopes: bool,
     final_only: bool,
 ) -> tuple[jax.Array, list]:
-    """Return the saved states and the last, or the last alone, by a program that takes all parameters as arguments.
+    """Return the saved states, shape (saves, n), or the final state, shape (n,), of a run with fixed steps.
 
     With ``return_slopes`` also return, for each engine call, the state at the start of each step, its compensation, and
-    the slopes that solve its equations.
+    the slopes that solve its equations. All parameters are arguments, so the function can be compiled once.
     """
-    system, method, x = arguments
+    system, method, x = system_method_state
     carry, states, steps = initial_carry(system, method, x), [x[None]], []
     for i, (n_saves, n_substeps) in enumerate(save_counts):
 
         def step(carry, _, h=step_sizes[i]):
-            new_carry = differentiable_step(system, method, carry, h, solve_or_nan if newton else fixed_point_or_nan)
+            new_carry = differentiable_step(
+                system, method, carry, h, solve_stages_or_nan if uses_newton else iterate_fixed_point_or_nan
+            )
             return new_carry, (*carry[:2], new_carry[2]) if return_slopes else None
 
-        def save(carry, _, step=step, steps_per_save=n_substeps):
+        def take_steps_of_save(carry, _, step=step, steps_per_save=n_substeps):
             carry, solved_steps = jax.lax.scan(step, carry, length=steps_per_save)
             return carry, (carry[0], solved_steps)
 
-        carry, (saved_states, call_steps) = jax.lax.scan(save, carry, length=n_saves)
+        carry, (saved_states, call_steps) = jax.lax.scan(take_steps_of_save, carry, length=n_saves)
         states.append(saved_states)
         steps.append(call_steps)
-    return _select_saved(states, final_only), steps
+    return _concatenate_or_take_final(states, final_only), steps
 
 
-def _select_saved(states: Sequence, final_only: bool) -> jax.Array:
-    return states[-1][-1] if final_only else jnp.concatenate(states)
+def _concatenate_or_take_final(states_of_calls: Sequence, final_only: bool) -> jax.Array:
+    return states_of_calls[-1][-1] if final_only else jnp.concatenate(states_of_calls)
 
 
 def _saved_path_derivatives(
-    arguments: tuple,
+    system_method_state: tuple,
     leaf_is_traced: tuple[bool, ...],
     order: int,
     step_sizes,
     save_counts,
-    steps: list,
+    solved_steps: list,
     final_only: bool,
 ) -> list[np.ndarray]:
-    """Return the derivatives of the saved states up to an order, by all traced leaves in one row: shapes (..., n, p,
-    ..., p)."""
+    """Return the derivatives of the saved states of orders 1 to ``order``, shapes (..., n, p), (..., n, p, p), …
+
+    The p variables are the entries of all traced leaves.
+    """
     repeated_sizes = [
         np.repeat(h, n_saves * steps_per_save)
         for h, (n_saves, steps_per_save) in zip(step_sizes, save_counts, strict=True)
     ]
-    flat_calls = [[np.asarray(array).reshape(-1, *array.shape[2:]) for array in call] for call in steps]
+    flat_calls = [[np.asarray(array).reshape(-1, *array.shape[2:]) for array in call] for call in solved_steps]
     x, compensation, k = (np.concatenate(array) for array in zip(*flat_calls, strict=True))
     derivatives = state_derivatives(
-        arguments, leaf_is_traced, order, np.concatenate(repeated_sizes), (x, compensation, k)
+        system_method_state, leaf_is_traced, order, np.concatenate(repeated_sizes), (x, compensation, k)
     )
     save_indices = np.cumsum([0, *(steps_per_save for n_saves, steps_per_save in save_counts for _ in range(n_saves))])
     return [derivative[-1] if final_only else derivative[save_indices] for derivative in derivatives]
 
 
-def _attach_derivatives(path, derivatives: Sequence, leaves: Sequence, base_leaves: Sequence) -> jax.Array:
-    """Return the path plus its Taylor polynomial in ``leaves - base_leaves``, which is zero but has the given
-    derivatives."""
-    d = ravel_pytree([a - b for a, b in zip(leaves, base_leaves, strict=True)])[0]
+def _attach_derivatives(path, derivatives: Sequence, traced_leaves: Sequence, leaf_values: Sequence) -> jax.Array:
+    """Return the path with the given derivatives by the traced leaves.
+
+    The path plus its Taylor polynomial in ``traced_leaves - leaf_values``, which is zero, has these derivatives.
+    """
+    d = ravel_pytree([a - b for a, b in zip(traced_leaves, leaf_values, strict=True)])[0]
     for order, term in enumerate(derivatives, start=1):
         for _ in range(order):
             term = term @ d
@@ -382,29 +407,33 @@ def _attach_derivatives(path, derivatives: Sequence, leaves: Sequence, base_leav
     return path
 
 
-def _recompute_path(system: System, method: OneStepMethod, x, step_sizes, steps: list, final_only: bool) -> jax.Array:
-    """Return the path from solved steps, as a differentiable function of the initial state and the parameters."""
-    states = [x[None]]
-    for i, call_steps in enumerate(steps):
+def _differentiable_path_from_solved_steps(
+    system: System, method: OneStepMethod, initial_state, step_sizes, solved_steps: list, final_only: bool
+) -> jax.Array:
+    """Return the path of solved steps as a differentiable function of the initial state and the parameters."""
+    states = [initial_state[None]]
+    for i, call_steps in enumerate(solved_steps):
 
         def step(x, solved_step, h=step_sizes[i]):
             _, compensation, k = solved_step
-            step_system = system_of_step(system, x)
-            k = _implicit_slopes(step_system, method, x, compensation, h, k)
+            step_system = system_between_breaks(system, x)
+            k = _attach_implicit_derivative_to_slopes(step_system, method, x, compensation, h, k)
             return method.move(step_system, x, compensation, h, k)[0], None
 
-        def save(x, solved_steps, step=step):
-            x, _ = jax.lax.scan(step, x, solved_steps)
+        def take_steps_of_save(x, steps_of_save, step=step):
+            x, _ = jax.lax.scan(step, x, steps_of_save)
             return x, x
 
-        x, saved_states = jax.lax.scan(save, x, call_steps)
+        initial_state, saved_states = jax.lax.scan(take_steps_of_save, initial_state, call_steps)
         states.append(saved_states)
-    return _select_saved(states, final_only)
+    return _concatenate_or_take_final(states, final_only)
 
 
-def _implicit_slopes(system: System, method: OneStepMethod, x, compensation, h, k) -> jax.Array:
-    """Return known slopes k of a step, with the derivative that the stage equations define."""
-    return _solve_stages_implicitly(system, method, x, compensation, h, k, lambda equations: equations.guess)
+def _attach_implicit_derivative_to_slopes(system: System, method: OneStepMethod, x, compensation, h, k) -> jax.Array:
+    """Return the solved slopes k of a step, with the derivative that the stage equations define."""
+    return _solve_stages_with_implicit_derivative(
+        system, method, x, compensation, h, k, lambda equations: equations.guess
+    )
 
 
 def initial_carry(system: System, method: OneStepMethod, x) -> tuple[jax.Array, ...]:
@@ -413,30 +442,32 @@ def initial_carry(system: System, method: OneStepMethod, x) -> tuple[jax.Array, 
     return x, jnp.zeros_like(x), k, k
 
 
-def solve_or_nan(equations: StageEquations) -> jax.Array:
+def solve_stages_or_nan(equations: StageEquations) -> jax.Array:
     """Return the slopes that solve the stage equations of a step, or NaN if the solver fails."""
-    return _slopes_or_nan(solve_stages(equations))
+    return _converged_slopes_or_nan(solve_stages(equations))
 
 
-def fixed_point_or_nan(equations: StageEquations) -> jax.Array:
+def iterate_fixed_point_or_nan(equations: StageEquations) -> jax.Array:
     """Return the slopes that solve the stage equations by fixed-point iteration, or NaN if it fails."""
-    return _slopes_or_nan(solve_fixed_point(equations))
+    return _converged_slopes_or_nan(solve_fixed_point(equations))
 
 
-def _slopes_or_nan(solution: StageSolution) -> jax.Array:
+def _converged_slopes_or_nan(solution: StageSolution) -> jax.Array:
     return jnp.where(solution.converged, solution.k, jnp.nan)
 
 
 def differentiable_step(
-    system: System, method: OneStepMethod, carry: tuple[jax.Array, ...], h, solve: Callable = solve_or_nan
+    system: System, method: OneStepMethod, carry: tuple[jax.Array, ...], h, stage_solver: Callable = solve_stages_or_nan
 ) -> tuple[jax.Array, ...]:
-    """Return the carry after a step that JAX can differentiate; NaN if its equations cannot be solved."""
+    """Return the carry after one step, differentiable by JAX; NaN if the stage equations cannot be solved."""
     x, compensation, k, older_k = carry
-    system = system_of_step(system, x)
+    system = system_between_breaks(system, x)
     if method.explicit:
-        new_k = _slopes_or_nan(explicit_stage_solution(system, method, x, compensation, h, k))
+        new_k = _converged_slopes_or_nan(explicit_stage_solution(system, method, x, compensation, h, k))
     else:
-        new_k = _solve_stages_implicitly(system, method, x, compensation, h, method.predict(k, older_k), solve)
+        new_k = _solve_stages_with_implicit_derivative(
+            system, method, x, compensation, h, method.predict(k, older_k), stage_solver
+        )
     new_x, new_compensation, energy, *_ = end_of_step(system, method, x, compensation, h, new_k)
     if can_correct_energy_drift(system, method):
         new_compensation = compensation_after_drift_correction(
@@ -448,18 +479,20 @@ def differentiable_step(
     return new_x, new_compensation, new_k, k
 
 
-def _solve_stages_implicitly(
-    system: System, method: OneStepMethod, x, compensation, h, guess, solve: Callable
+def _solve_stages_with_implicit_derivative(
+    system: System, method: OneStepMethod, x, compensation, h, guess, stage_solver: Callable
 ) -> jax.Array:
-    """Solve the stage equations by ``solve``; the derivative of the solution is that of the implicit function."""
-    dynamic, static = eqx.partition((system, method, x, compensation, h), eqx.is_array)
+    """Return the slopes that ``stage_solver`` computes, with the derivative from the implicit function theorem."""
+    array_leaves, static = eqx.partition((system, method, x, compensation, h), eqx.is_array)
 
-    def slopes(dynamic, k):
-        system, method, x, compensation, h = eqx.combine(dynamic, static)
+    def slopes(array_leaves, k):
+        system, method, x, compensation, h = eqx.combine(array_leaves, static)
         return method.slopes(system, x, compensation, h, k)
 
-    def solution(dynamic, guess):
-        system, method, x, compensation, h = eqx.combine(dynamic, static)
-        return solve(stage_equations(system, method, x, compensation, h, guess, guess)._replace(guess=guess))
+    def solve_from_arrays(array_leaves, guess):
+        system, method, x, compensation, h = eqx.combine(array_leaves, static)
+        return stage_solver(stage_equations(system, method, x, compensation, h, guess, guess)._replace(guess=guess))
 
-    return implicit_solution(solution, lambda dynamic, k: slopes(dynamic, k) - k, dynamic, guess)
+    return solve_with_implicit_derivative(
+        solve_from_arrays, lambda dynamic, k: slopes(dynamic, k) - k, array_leaves, guess
+    )

@@ -29,14 +29,14 @@ from jax.interpreters import ad, batching, mlir
 
 from manifolds.matrices.linear import inverse
 
-from ..systems.clock import system_of_step
+from ..systems.clock import system_between_breaks
 from ..tracing.interpret import evaluate_at_points
 
 
-def implicit_solution(solve: Callable, residual: Callable, parameters: Any, guess: jax.Array) -> jax.Array:
-    """Return the k with ``residual(parameters, k) = 0`` that ``solve`` computes, as a differentiable array.
+def solve_with_implicit_derivative(solve: Callable, residual: Callable, parameters: Any, guess: jax.Array) -> jax.Array:
+    """Return the solution k of ``residual(parameters, k) = 0`` that ``solve`` computes, as a differentiable array.
 
-    Its derivative is ``-(D_k residual)^-1 D residual``, whatever ``solve`` does. Neither function may close over
+    The derivative is ``-(D_k residual)^-1 D residual``, whatever ``solve`` does. Neither function may close over
     tracers.
 
     Parameters
@@ -46,33 +46,36 @@ def implicit_solution(solve: Callable, residual: Callable, parameters: Any, gues
     guess : array, of the shape of k
     """
     leaves, structure = jax.tree_util.tree_flatten(parameters)
-    return _implicit_solution.bind(*leaves, guess, solve=solve, residual=residual, structure=structure, axes=())
+    return _implicit_solution.bind(*leaves, guess, solve=solve, residual=residual, structure=structure, vmap_axes=())
 
 
 _implicit_solution = Primitive("solution")
 
 
-def _run_solver(*arguments, solve: Callable, residual: Callable, structure, axes: tuple) -> jax.Array:
-    """Run the solver; ``axes`` holds the argument axes of each enclosing ``vmap``, innermost first."""
+def _run_solver(*arguments, solve: Callable, residual: Callable, structure, vmap_axes: tuple) -> jax.Array:
+    """Run ``solve`` under one ``jax.vmap`` for each entry of ``vmap_axes``, innermost first, and return the solution.
+
+    An entry holds the axes of the arguments that an enclosing ``vmap`` maps over.
+    """
     del residual
 
     def solve_one(*arguments):
         *leaves, guess = arguments
         return solve(jax.tree_util.tree_unflatten(structure, leaves), guess)
 
-    return _nest_vmaps(solve_one, axes)(*arguments)
+    return _nest_vmaps(solve_one, vmap_axes)(*arguments)
 
 
-def _nest_vmaps(function: Callable, axes: Sequence[tuple]) -> Callable:
-    for axes_of_level in axes:
+def _nest_vmaps(function: Callable, vmap_axes: Sequence[tuple]) -> Callable:
+    for axes_of_level in vmap_axes:
         function = jax.vmap(function, in_axes=axes_of_level)
     return function
 
 
-def _abstract_eval(*arguments, axes: tuple, **_):
+def _abstract_solution(*arguments, vmap_axes: tuple, **_):
     shape, guess = arguments[-1].shape, arguments[-1]
     sizes = []
-    for axes_of_level in reversed(axes):
+    for axes_of_level in reversed(vmap_axes):
         sizes.append(next(a.shape[axis] for a, axis in zip(arguments, axes_of_level, strict=True) if axis is not None))
         arguments = tuple(_shape_without_axis(a, axis) for a, axis in zip(arguments, axes_of_level, strict=True))
         shape = arguments[-1].shape
@@ -80,18 +83,20 @@ def _abstract_eval(*arguments, axes: tuple, **_):
 
 
 def _shape_without_axis(a, axis: int | None):
-    """Return the shape of an argument inside ``vmap``."""
+    """Return an array's shape without one axis, as ``vmap`` over this axis sees it; None removes no axis."""
     if axis is None:
         return a
     return jax.ShapeDtypeStruct(a.shape[:axis] + a.shape[axis + 1 :], a.dtype)
 
 
-def _batching_rule(arguments, dims, *, axes: tuple, **rest):
-    return _implicit_solution.bind(*arguments, axes=(*axes, tuple(dims)), **rest), 0
+def _batching_rule(arguments, dims, *, vmap_axes: tuple, **other_parameters):
+    return _implicit_solution.bind(*arguments, vmap_axes=(*vmap_axes, tuple(dims)), **other_parameters), 0
 
 
-def _jvp_rule(primals, tangents, *, residual: Callable, structure, axes: tuple, **rest):
-    k = _implicit_solution.bind(*primals, residual=residual, structure=structure, axes=axes, **rest)
+def _jvp_rule(primals, tangents, *, residual: Callable, structure, vmap_axes: tuple, **other_parameters):
+    k = _implicit_solution.bind(
+        *primals, residual=residual, structure=structure, vmap_axes=vmap_axes, **other_parameters
+    )
     active = [i for i, tangent in enumerate(tangents[:-1]) if type(tangent) is not ad.Zero]
     if not active:
         return k, jnp.zeros_like(k)
@@ -102,8 +107,8 @@ def _jvp_rule(primals, tangents, *, residual: Callable, structure, axes: tuple, 
 
         def active_residual(k, *values):
             leaf_values = list(leaves)
-            for i, value in zip(active, values, strict=True):
-                leaf_values[i] = value
+            for i, leaf_value in zip(active, values, strict=True):
+                leaf_values[i] = leaf_value
             return residual(jax.tree_util.tree_unflatten(structure, leaf_values), k)
 
         _, residual_jvp = jax.linearize(active_residual, k, *(leaves[i] for i in active))
@@ -120,12 +125,12 @@ def _jvp_rule(primals, tangents, *, residual: Callable, structure, axes: tuple, 
             transpose_solve=lambda _, b: (b.ravel() @ matrix_inverse).reshape(k.shape),
         )
 
-    levels = [(0, *axes_of_level[:-1], *(axes_of_level[i] for i in active)) for axes_of_level in axes]
+    levels = [(0, *axes_of_level[:-1], *(axes_of_level[i] for i in active)) for axes_of_level in vmap_axes]
     return k, _nest_vmaps(solution_tangent, levels)(k, *leaves, *active_tangents)
 
 
 _implicit_solution.def_impl(lambda *arguments, **rest: jax.jit(lambda *a: _run_solver(*a, **rest))(*arguments))
-_implicit_solution.def_abstract_eval(_abstract_eval)
+_implicit_solution.def_abstract_eval(_abstract_solution)
 batching.primitive_batchers[_implicit_solution] = _batching_rule
 ad.primitive_jvps[_implicit_solution] = _jvp_rule
 mlir.register_lowering(_implicit_solution, mlir.lower_fun(_run_solver, multiple_results=False))
@@ -136,7 +141,7 @@ MAX_VALUES_PER_CALL = 1_000_000
 
 
 class _StepFunction(eqx.Module):
-    """One step as a function of z and k in one row, for given step size and compensation.
+    """Function from state, parameters and slopes of a step, in one row, to its stage residual and end state.
 
     Attributes
     ----------
@@ -156,7 +161,7 @@ class _StepFunction(eqx.Module):
     slopes_shape: tuple[int, int] = eqx.field(static=True)
     order: int = eqx.field(static=True)
 
-    def unpack(self, z) -> tuple[Any, Any, jax.Array, jax.Array]:
+    def unpack_row(self, z) -> tuple[Any, Any, jax.Array, jax.Array]:
         """Return system, method, state and slopes from z, shape (n + q + m,): state, parameters and slopes."""
         leaves, structure = jax.tree_util.tree_flatten(self.system_method_state)
         *other_leaves, x = leaves
@@ -170,26 +175,26 @@ class _StepFunction(eqx.Module):
             for leaf, is_parameter in zip(other_leaves, self.is_differentiated[:-1], strict=True)
         ]
         system, method, _ = jax.tree_util.tree_unflatten(structure, [*other_leaves, x])
-        return system_of_step(system, z[:n]), method, z[:n], z[len(z) - m :].reshape(self.slopes_shape)
+        return system_between_breaks(system, z[:n]), method, z[:n], z[len(z) - m :].reshape(self.slopes_shape)
 
     def __call__(self, h, compensation, z) -> jax.Array:
         """Return the residual of the stage equations, followed by the next state."""
-        system, method, x, k = self.unpack(z)
+        system, method, x, k = self.unpack_row(z)
         residual = method.slopes(system, x, compensation, h, k) - k
         return jnp.concatenate([residual.ravel(), method.move(system, x, compensation, h, k)[0]])
 
 
-def _mixed_directional_derivative(step: _StepFunction, point) -> jax.Array:
-    """Return the derivative of a step along ``step.order`` directions, by nested forward mode.
+def _mixed_directional_derivative(step_function: _StepFunction, point_row) -> jax.Array:
+    """Return the derivative of a step along ``step_function.order`` directions, by nested forward mode.
 
-    Rows of the point are z and k and their derivatives; the row of a subset of directions is the one whose number has
-    the bits of the subset.
+    The point holds the step size, the compensation, and 2**order rows: the values of state, parameters and slopes, and
+    their derivatives along subsets of the directions. The bits of a row's number select its subset.
     """
-    n = np.size(step.system_method_state[-1])
-    h, compensation, rows = point[0], point[1 : 1 + n], point[1 + n :].reshape(2**step.order, -1)
+    n = np.size(step_function.system_method_state[-1])
+    h, compensation, rows = point_row[0], point_row[1 : 1 + n], point_row[1 + n :].reshape(2**step_function.order, -1)
 
-    def value(rows):
-        return step(h, compensation, rows[0])[None]
+    def step_of_first_row(rows):
+        return step_function(h, compensation, rows[0])[None]
 
     def differentiate(function):
         def value_and_tangent(rows):
@@ -198,30 +203,30 @@ def _mixed_directional_derivative(step: _StepFunction, point) -> jax.Array:
 
         return value_and_tangent
 
-    function = value
-    for _ in range(step.order):
+    function = step_of_first_row
+    for _ in range(step_function.order):
         function = differentiate(function)
     return function(rows)[-1]
 
 
 def state_derivatives(
-    arguments: tuple,
+    system_method_state: tuple,
     leaf_is_traced: Sequence[bool],
     order: int,
     step_sizes: np.ndarray,
-    path: tuple[np.ndarray, np.ndarray, np.ndarray],
+    solved_steps: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> list[np.ndarray]:
-    """Return the derivatives of the states of a path, from the initial state on, of orders 1 to ``order``.
+    """Return the derivatives of all states of a path by parameters and initial state, of orders 1 to ``order``.
 
     Parameters
     ----------
-    arguments : (System, OneStepMethod, array)
+    system_method_state : (System, OneStepMethod, array)
         Concrete values, nothing traced. The array is the initial state.
     leaf_is_traced : sequence of bool
-        For each leaf of ``arguments``, whether it is differentiated by.
+        For each leaf of ``system_method_state``, whether it is differentiated by.
     order : int
     step_sizes : array, shape (steps,)
-    path : (array, array, array)
+    solved_steps : (array, array, array)
         For each step its state, shape (n,), the compensation of the state, and the slopes that solve its equations,
         shape (stages, n).
 
@@ -231,37 +236,43 @@ def state_derivatives(
         Shapes (steps + 1, n, p), (steps + 1, n, p, p) and so on; p is the number of entries of all leaves that are
         differentiated by, in one row.
     """
-    x, compensation, k = path
-    count, n, m = len(x), x.shape[1], k[0].size
-    parameters, initial_state = _differentiated_parameters_and_state(arguments, leaf_is_traced)
+    x, compensation, k = solved_steps
+    n_steps, n, m = len(x), x.shape[1], k[0].size
+    parameters, initial_state = _differentiated_parameters_and_state(system_method_state, leaf_is_traced)
     q, p = len(parameters), len(parameters) + len(initial_state)
-    base_rows = np.concatenate([x, np.broadcast_to(parameters, (count, q)), k.reshape(count, m)], axis=1)
+    base_rows = np.concatenate([x, np.broadcast_to(parameters, (n_steps, q)), k.reshape(n_steps, m)], axis=1)
 
-    def evaluate_along(rows: Callable[[slice], np.ndarray], n_sets: int, rank: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return derivatives of residual and move, shapes (steps, m, n_sets) and (steps, n, n_sets).
+    def evaluate_derivatives_along(
+        rows_of_chunk: Callable[[slice], np.ndarray], n_direction_sets: int, rank: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivatives of stage residuals and end states along direction sets of ``rank`` directions.
 
-        ``rows`` returns the rows of a chunk of steps, shape (steps, n_sets, 2**rank, n + q + m); the rows of all steps
-        would fill the memory.
+        Their shapes are (steps, m, n_direction_sets) and (steps, n, n_direction_sets).
+
+        ``rows_of_chunk`` returns the rows of a chunk of steps, shape (steps, n_direction_sets, 2**rank, n + q + m); the
+        rows of all steps would fill the memory.
         """
         step, derivatives = (
-            _StepFunction(arguments, tuple(leaf_is_traced), k.shape[1:], rank),
-            np.empty((count, n_sets, m + n)),
+            _StepFunction(system_method_state, tuple(leaf_is_traced), k.shape[1:], rank),
+            np.empty((n_steps, n_direction_sets, m + n)),
         )
-        chunk_size = max(1, MAX_VALUES_PER_CALL // (n_sets * 2**rank * (n + q + m)))
-        for chunk in (slice(i, i + chunk_size) for i in range(0, count, chunk_size)):
-            begin = np.concatenate([step_sizes[chunk, None], compensation[chunk]], axis=1)[:, None].repeat(
-                n_sets, axis=1
+        chunk_size = max(1, MAX_VALUES_PER_CALL // (n_direction_sets * 2**rank * (n + q + m)))
+        for chunk in (slice(i, i + chunk_size) for i in range(0, n_steps, chunk_size)):
+            leading_columns = np.concatenate([step_sizes[chunk, None], compensation[chunk]], axis=1)[:, None].repeat(
+                n_direction_sets, axis=1
             )
-            points = np.concatenate([begin, rows(chunk).reshape(*begin.shape[:2], -1)], axis=2)
+            points = np.concatenate(
+                [leading_columns, rows_of_chunk(chunk).reshape(*leading_columns.shape[:2], -1)], axis=2
+            )
             values = evaluate_at_points(_mixed_directional_derivative, step, points.reshape(-1, points.shape[-1]))
-            derivatives[chunk] = values.reshape(*begin.shape[:2], m + n)
+            derivatives[chunk] = values.reshape(*leading_columns.shape[:2], m + n)
         return derivatives[..., :m].swapaxes(1, 2), derivatives[..., m:].swapaxes(1, 2)
 
-    def unit_directions(chunk: slice) -> np.ndarray:
+    def unit_direction_rows(chunk: slice) -> np.ndarray:
         units = np.broadcast_to(np.eye(n + q + m), (len(base_rows[chunk]), n + q + m, n + q + m))
         return np.stack([np.broadcast_to(base_rows[chunk, None], units.shape), units], axis=2)
 
-    residual_jacobian, state_jacobian = evaluate_along(unit_directions, n + q + m, 1)
+    residual_jacobian, state_jacobian = evaluate_derivatives_along(unit_direction_rows, n + q + m, 1)
     slopes_of_residual = -_inverse_or_nan(
         residual_jacobian[..., n + q :]
     )  # from a residual to the k that makes up for it
@@ -274,7 +285,7 @@ def state_derivatives(
         [base_rows],
     )  # derivatives of each order: of the states, and of z and k, (steps, n + q + m, p, ...)
     for rank in range(1, order + 1):
-        direction_sets, entry_index = _symmetric_indices(p, rank)
+        direction_sets, entry_index = _symmetric_index_sets_and_positions(p, rank)
         if rank == 1:
             parameter_derivative = np.eye(q, p)  # parameters move in the directions of their own
             residual, forcing = (
@@ -283,14 +294,14 @@ def state_derivatives(
             )
         else:
             parameter_derivative = np.zeros((q, len(direction_sets)))
-            residual, forcing = evaluate_along(
+            residual, forcing = evaluate_derivatives_along(
                 functools.partial(_lower_order_rows, row_derivatives, direction_sets), len(direction_sets), rank
             )
             forcing = forcing + state_jacobian[..., n + q :] @ slopes_of_residual @ residual
-        state_derivative = np.zeros((count + 1, n, len(direction_sets)))
+        state_derivative = np.zeros((n_steps + 1, n, len(direction_sets)))
         if rank == 1:
             state_derivative[0, :, q:] = np.eye(n, len(initial_state))
-        for j in range(count):
+        for j in range(n_steps):
             state_derivative[j + 1] = step_jacobian[j, :, :n] @ state_derivative[j] + forcing[j]
         states.append(state_derivative[..., entry_index])
         if rank < order:
@@ -298,7 +309,7 @@ def state_derivatives(
             row_derivative = np.concatenate(
                 [
                     state_derivative[:-1],
-                    np.broadcast_to(parameter_derivative, (count, *parameter_derivative.shape)),
+                    np.broadcast_to(parameter_derivative, (n_steps, *parameter_derivative.shape)),
                     slopes,
                 ],
                 axis=1,
@@ -308,14 +319,14 @@ def state_derivatives(
 
 
 def _lower_order_rows(
-    derivatives: Sequence[np.ndarray], direction_sets: Sequence[tuple[int, ...]], chunk: slice
+    row_derivatives: Sequence[np.ndarray], direction_sets: Sequence[tuple[int, ...]], step_slice: slice
 ) -> np.ndarray:
     """Return the derivatives along each proper subset of each direction set, shape (steps, sets, 2**rank, n + q + m).
 
     The rank is the number of directions in a set. The bits of an index of the third axis select the subset; its last
     entry, for the whole set, is zero.
     """
-    chunk_derivatives, rank = [a[chunk] for a in derivatives], len(direction_sets[0])
+    chunk_derivatives, rank = [a[step_slice] for a in row_derivatives], len(direction_sets[0])
     rows = np.zeros((len(chunk_derivatives[0]), len(direction_sets), 2**rank, chunk_derivatives[0].shape[1]))
     for i, directions in enumerate(direction_sets):
         for subset in range(2**rank - 1):
@@ -325,10 +336,10 @@ def _lower_order_rows(
 
 
 def _differentiated_parameters_and_state(
-    arguments: tuple, leaf_is_traced: Sequence[bool]
+    system_method_state: tuple, leaf_is_traced: Sequence[bool]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the parameters and the initial state that are differentiated by, one row each; empty if there are none."""
-    leaves = jax.tree_util.tree_leaves(arguments)
+    leaves = jax.tree_util.tree_leaves(system_method_state)
     *parameters, initial_state = (
         np.ravel(leaf) if is_differentiated else np.zeros(0)
         for leaf, is_differentiated in zip(leaves, leaf_is_traced, strict=True)
@@ -336,15 +347,17 @@ def _differentiated_parameters_and_state(
     return np.concatenate([np.zeros(0), *parameters]), initial_state
 
 
-def _symmetric_indices(p: int, rank: int) -> tuple[list[tuple[int, ...]], np.ndarray]:
-    """Return the distinct index sets of a symmetric tensor of rank ``rank`` over p variables, and for each entry of the
-    tensor the number of its set."""
-    direction_sets = list(itertools.combinations_with_replacement(range(p), rank))
-    entry_index = np.empty((p,) * rank, dtype=int)
-    for i, directions in enumerate(direction_sets):
+def _symmetric_index_sets_and_positions(n_variables: int, rank: int) -> tuple[list[tuple[int, ...]], np.ndarray]:
+    """Return the distinct index sets of a symmetric tensor over ``n_variables``, and each entry's position among them.
+
+    The positions have ``rank`` axes of length ``n_variables``.
+    """
+    index_sets = list(itertools.combinations_with_replacement(range(n_variables), rank))
+    entry_index = np.empty((n_variables,) * rank, dtype=int)
+    for i, directions in enumerate(index_sets):
         for permutation in itertools.permutations(directions):
             entry_index[permutation] = i
-    return direction_sets, entry_index
+    return index_sets, entry_index
 
 
 def _inverse_or_nan(matrices: np.ndarray) -> np.ndarray:

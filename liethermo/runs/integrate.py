@@ -156,7 +156,7 @@ def integrate(
 
 @with_library_settings
 def solution_without_steps(system: System, x0, t: float, method: OneStepMethod) -> Solution:
-    """Return the solution over a span of length zero: the initial state at time t.
+    """Return a solution that holds only the initial state, at time t.
 
     Raises
     ------
@@ -165,5 +165,5 @@ def solution_without_steps(system: System, x0, t: float, method: OneStepMethod) 
     """
     problem = Problem.from_user(system, method, x0=x0)
     run = Run(problem, problem.initial_state(x0, t), StepSchedule.zero_length(t), None, "auto", dense=True)
-    run.take_no_step()
+    run.complete_without_steps()
     return run.solution_so_far()

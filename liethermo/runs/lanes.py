@@ -1,4 +1,4 @@
-"""Lanes of a family of systems, for runs of ensembles and for audits that repeat their steps."""
+"""Lanes (trajectories that advance together) of a family of systems, for ensembles and for audits that replay steps."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LANES_PER_BLOCK = 8
 """Number of trajectories in a block of the compiled engine: one AVX-512 vector, or two of AVX2."""
 
 
-class LaneParameters:
+class CompiledLanes:
     """Compiled step loop of a family and a method, with the parameters of its trajectories."""
 
     def __init__(self, family: Family, method: OneStepMethod, control: StepControl | None = None):
@@ -27,15 +27,25 @@ class LaneParameters:
         self.first_lane_parameters = np.append(family.parameter_matrix(slice(0, 1), 1)[0], self.shared_parameters)
         self.is_per_trajectory = np.append(family.is_per_trajectory, np.zeros(len(self.shared_parameters), dtype=bool))
         self.step_loop = cached_step_loop(
-            family.form, self.first_lane_parameters, method, control, LANES_PER_BLOCK, self.is_per_trajectory
+            family.program_structure,
+            self.first_lane_parameters,
+            method,
+            control,
+            LANES_PER_BLOCK,
+            self.is_per_trajectory,
         )
 
-    def start_batch(self, members: slice, x: np.ndarray) -> CompiledBatch:
-        """Return the batch of some members of the family, with steps of given sizes, from states x, shape (B, n)."""
-        return CompiledBatch(self.step_loop, self.first_lane_parameters, self.parameters(members, len(x)), x)
+    def start_compiled_batch(self, members: slice, initial_states: np.ndarray) -> CompiledBatch:
+        """Return a batch of members of the family that takes fixed steps from ``initial_states``, shape (B, n)."""
+        return CompiledBatch(
+            self.step_loop,
+            self.first_lane_parameters,
+            self.parameters_of_members(members, len(initial_states)),
+            initial_states,
+        )
 
-    def parameters(self, members: slice, n_members: int) -> np.ndarray:
-        """Return the parameters that lanes read: of all members, shape (p,), if these agree, else (n_members, p)."""
+    def parameters_of_members(self, members: slice, n_members: int) -> np.ndarray:
+        """Return the parameters that lanes read, shape (n_members, p), or (p,) if all members have the same values."""
         if not self.is_per_trajectory.any():
             return self.first_lane_parameters
         return np.hstack(
@@ -47,7 +57,7 @@ class LaneParameters:
 
 
 def padded_member_indices(start: int, stop: int, dim: int) -> np.ndarray:
-    """Return the indices from ``start`` to ``stop``, the last one repeated until they fill whole SIMD vectors.
+    """Return the indices from ``start`` up to ``stop``, padded with the last one to whole SIMD vectors.
 
     A partly filled vector would round differently, so padding makes results independent of the number of trajectories.
     States of large ``dim`` fill vectors by themselves.
@@ -63,26 +73,48 @@ REPLAY_STEPS_PER_CALL = 32
 
 
 def replay_steps(
-    engine: str, family: Family, method: OneStepMethod, x: np.ndarray, h: np.ndarray, steps: int = 1
+    engine: str,
+    family: Family,
+    method: OneStepMethod,
+    initial_states: np.ndarray,
+    step_sizes: np.ndarray,
+    n_steps: int = 1,
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Take ``steps`` steps of size h[i] with each member i of a small family, on an engine, "compiled" or "array".
+    """Take ``n_steps`` steps of size step_sizes[i] with each member i of a small family.
+
+    Parameters
+    ----------
+    engine : {"compiled", "array"}
+    family : Family
+    method : OneStepMethod
+    initial_states : array, shape (trajectories, n)
+    step_sizes : array, shape (trajectories,)
+    n_steps : int
 
     Returns
     -------
     dict of arrays
         Engine fields after the steps.
-    array, shape (trajectories, steps, n)
+    array, shape (trajectories, n_steps, n)
         States after each step.
     """
     batch: CompiledBatch | ArrayBatch
     if engine == "compiled":
-        batch, steps_per_call = LaneParameters(family, method).start_batch(slice(0, len(x)), x), max(1, steps)
+        batch, steps_per_call = (
+            CompiledLanes(family, method).start_compiled_batch(slice(0, len(initial_states)), initial_states),
+            max(1, n_steps),
+        )
     else:
         # filled up with copies of the last member to a power of two: few numbers of lanes, few programs
-        rows = np.minimum(np.arange(1 << (len(x) - 1).bit_length()), len(x) - 1)
-        arguments = family.form, *family.vmap_arguments(rows), method
-        batch, h = ArrayBatch(*arguments, x[rows], min_capacity=REPLAY_STEPS_PER_CALL), h[rows]
+        rows = np.minimum(np.arange(1 << (len(initial_states) - 1).bit_length()), len(initial_states) - 1)
+        arguments = family.program_structure, *family.vmap_arguments(rows), method
+        batch, step_sizes = (
+            ArrayBatch(*arguments, initial_states[rows], min_capacity=REPLAY_STEPS_PER_CALL),
+            step_sizes[rows],
+        )
         steps_per_call = REPLAY_STEPS_PER_CALL
-    counts = [min(steps_per_call, steps - n_done) for n_done in range(0, steps, steps_per_call)]
-    states = [batch.advance(h, n_saves, 1)[: len(x), :, :-2] for n_saves in counts]
-    return {name: values[: len(x)] for name, values in batch.read().items()}, np.concatenate(states, axis=1)
+    counts = [min(steps_per_call, n_steps - n_done) for n_done in range(0, n_steps, steps_per_call)]
+    states = [batch.advance(step_sizes, n_saves, 1)[: len(initial_states), :, :-2] for n_saves in counts]
+    return {name: values[: len(initial_states)] for name, values in batch.read().items()}, np.concatenate(
+        states, axis=1
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,14 +13,11 @@ from jax.tree_util import DictKey, GetAttrKey, SequenceKey
 
 from manifolds._arrays import host_array, real_array
 
-from ..dissipation.base import Dissipation
-from ..dissipation.checks import NEGATIVE_RATE_MESSAGE
 from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
 from ..errors import InputError
-from ..functions.bath_energy import BathEnergy
-from ..functions.conditions import condition_message, require_condition
+from ..functions.conditions import Condition, condition_of_field
 from ..functions.energy import Quadratic
-from ..models.inertia import inverse_moments
+from ..models.inertia import INERTIA_CONDITION, inverse_moments
 from ..systems import System
 from ..tracing.caching import memoize
 
@@ -32,23 +29,26 @@ DERIVED_FIELDS = frozenset({"momentum_maps", "momentum_casimirs", "subsystems"})
 
 
 class NamedParameter(NamedTuple):
-    """A parameter of a system.
+    """The value of a parameter of a system, and the arrays of the system that store it.
 
     Attributes
     ----------
     value : ndarray
-    leaves : tuple of int
-        Numbers of the arrays of the system that hold it, in the order of :func:`parameter_arrays`.
+    leaf_indices : tuple of int
+        Numbers of the arrays of the system that hold the parameter, in the order of :func:`parameter_arrays`.
     is_inverse : bool
         Whether these arrays hold the inverse: those of an energy with moments of inertia do.
+    condition : Condition or None
+        The condition of the constructor on the value.
     """
 
     value: np.ndarray
-    leaves: tuple[int, ...]
+    leaf_indices: tuple[int, ...]
     is_inverse: bool = False
+    condition: Condition | None = None
 
-    def to_leaf(self, value):
-        """Convert a value of the parameter, or several along the first axis, to the array that the system stores.
+    def to_stored_array(self, value):
+        """Return the array that the system stores for a value of the parameter, or for several along the first axis.
 
         Parameters
         ----------
@@ -64,14 +64,14 @@ class NamedParameter(NamedTuple):
 def named_parameters(system: System) -> dict[str, np.ndarray]:
     """Return the parameters of a system by name, such as ``dissipation.rate``.
 
-    The names are those of the user's objects, whether or not the system has baths, a clock or an attitude. What is kept
-    in several places, such as the capacity of a bath, is one parameter. A rigid body has ``energy.inertia``.
+    The names are those of the user's objects, whether or not the system has baths, a clock or an attitude. A value that
+    is stored in several places, such as the capacity of a bath, is one parameter. A rigid body has ``energy.inertia``.
     """
     return {name: parameter.value for name, parameter in _parameters_by_name_and_by_path(system)[0].items()}
 
 
-def replace_parameters(system: System, values: Mapping[str, Any]) -> System:
-    """Return a system with new values of some of its parameters, traced or not, by name.
+def replace_parameters(system: System, parameter_values: Mapping[str, Any]) -> System:
+    """Return a copy of a system with new values, traced or not, of the named parameters.
 
     Raises
     ------
@@ -81,63 +81,21 @@ def replace_parameters(system: System, values: Mapping[str, Any]) -> System:
     """
     # the system's own arrays, which cannot change in place, so that results for the new system can be cached
     leaves: list[Any] = jax.tree_util.tree_leaves(eqx.filter(system, eqx.is_inexact_array))
-    replaced: dict[int, str] = {}
-    conditions = conditions_by_leaf(system)
-    for name, value in values.items():
-        parameter = find_parameter(system, name)
+    names_by_leaf: dict[int, str] = {}
+    for name, value in parameter_values.items():
+        parameter = require_parameter(system, name)
         array = host_array(real_array(value))
         if array.shape != parameter.value.shape:
             raise InputError(f"{name} must have shape {parameter.value.shape}, got {array.shape}")
-        _check_and_record_name(replaced, name, parameter)
-        for i in parameter.leaves:
-            leaves[i] = real_array(parameter.to_leaf(array))
-            if i in conditions:
-                require_condition(leaves[i], conditions[i].test, conditions[i].template)
+        _record_name_of_leaves(names_by_leaf, name, parameter)
+        if parameter.condition is not None:
+            parameter.condition.require(array)
+        for i in parameter.leaf_indices:
+            leaves[i] = real_array(parameter.to_stored_array(array))
     return ProgramStructure.from_module(system).rebuild(leaves)
 
 
-class ParameterCondition(NamedTuple):
-    """A condition of a constructor on the values of a field, which new values have to meet.
-
-    Attributes
-    ----------
-    owner : type
-    field : str
-    test : function from an array to an array of truth values
-    template : str
-        The message of the error, with a placeholder ``{value}``.
-    """
-
-    owner: type
-    field: str
-    test: Callable
-    template: str
-
-
-PARAMETER_CONDITIONS = (
-    ParameterCondition(Dissipation, "rate", lambda value: value >= 0.0, NEGATIVE_RATE_MESSAGE),
-    ParameterCondition(
-        BathEnergy, "capacity", lambda value: value > 0.0, "the capacity of a bath must be positive, got {value}"
-    ),
-    ParameterCondition(
-        BathEnergy, "temperature", lambda value: value > 0.0, "the temperature of a bath must be positive, got {value}"
-    ),
-)
-
-
-def conditions_by_leaf(system: System) -> dict[int, ParameterCondition]:
-    """Return the conditions on the arrays of a system, by the number of the array."""
-    conditions = {}
-    leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_inexact_array))
-    for i, (path, _) in enumerate(leaves):
-        for condition in PARAMETER_CONDITIONS:
-            is_field = bool(path) and path[-1] == GetAttrKey(condition.field)
-            if is_field and isinstance(_node_at(system, path[:-1]), condition.owner):
-                conditions[i] = condition
-    return conditions
-
-
-def refused_members(system: System, arrays: Sequence[np.ndarray]) -> dict[int, str]:
+def reasons_of_refused_members(system: System, parameter_values: Mapping[str, Any]) -> dict[int, str]:
     """Return the members of a family with a value that the constructor of its object refuses, with the reasons.
 
     Members with NaN are left out: the family has a reason for them.
@@ -145,15 +103,20 @@ def refused_members(system: System, arrays: Sequence[np.ndarray]) -> dict[int, s
     Parameters
     ----------
     system : System
-    arrays : list of array
-        As :func:`arrays_with_members` returns them.
+    parameter_values : mapping of str to array, shape (members, ...)
     """
-    reasons = {}
-    for i, condition in conditions_by_leaf(system).items():
-        is_refused = ~np.asarray(condition.test(arrays[i])) & ~np.isnan(arrays[i])
-        for member in np.flatnonzero(is_refused.reshape(len(arrays[i]), -1).any(axis=1)):
-            reasons[int(member)] = condition_message(condition.template, arrays[i][member])
+    reasons: dict[int, str] = {}
+    for name, value in parameter_values.items():
+        condition = require_parameter(system, name).condition
+        if condition is not None:
+            reasons |= condition.violations(np.asarray(value, dtype=np.float64))
     return reasons
+
+
+def _condition_at(system: System, path: Sequence[Any]) -> Condition | None:
+    """Return the condition of the field of a system that holds the array at a path; None if it has none."""
+    ends = [i for i, key in enumerate(path) if isinstance(key, GetAttrKey)]
+    return condition_of_field(_node_at(system, path[: ends[-1]]), path[ends[-1]].name) if ends else None
 
 
 def _node_at(tree: Any, path: Sequence[Any]) -> Any:
@@ -168,10 +131,10 @@ def _node_at(tree: Any, path: Sequence[Any]) -> Any:
     return tree
 
 
-def arrays_with_members(system: System, values: Mapping[str, Any]) -> list[np.ndarray]:
-    """Return the arrays of a family of systems (members along the first axis), with given values of some parameters.
+def stack_member_arrays(system: System, member_values: Mapping[str, Any]) -> list[np.ndarray]:
+    """Return the arrays of a family of systems, with the members along the first axis, from values of some parameters.
 
-    Arrays that all members share have a first axis of length 1.
+    Parameters without ``member_values`` have the values of ``system`` and a first axis of length 1.
 
     Raises
     ------
@@ -179,27 +142,27 @@ def arrays_with_members(system: System, values: Mapping[str, Any]) -> list[np.nd
         If the system has no parameter of this name, or values have another shape.
     """
     leaves = [array[None] for array in parameter_arrays(system)]
-    replaced: dict[int, str] = {}
-    for name, value in values.items():
-        parameter, array = find_parameter(system, name), np.asarray(value, dtype=np.float64)
+    names_by_leaf: dict[int, str] = {}
+    for name, value in member_values.items():
+        parameter, array = require_parameter(system, name), np.asarray(value, dtype=np.float64)
         if array.ndim == 0 or array.shape[1:] != parameter.value.shape:
             expected_shape = ", ".join(["trajectories", *map(str, parameter.value.shape)])
             raise InputError(f"the values of {name} must have shape ({expected_shape}), got {array.shape}")
-        _check_and_record_name(replaced, name, parameter)
-        for i in parameter.leaves:
-            leaves[i] = np.asarray(parameter.to_leaf(array))
+        _record_name_of_leaves(names_by_leaf, name, parameter)
+        for i in parameter.leaf_indices:
+            leaves[i] = np.asarray(parameter.to_stored_array(array))
     return leaves
 
 
-def find_parameter(system: System, name: str) -> NamedParameter:
-    """Return the parameter that :func:`lookup_parameter` finds; raise InputError if there is none.
+def require_parameter(system: System, name: str) -> NamedParameter:
+    """Return the parameter with a name or path; raise InputError if the system has none.
 
     Raises
     ------
     InputError
-        If there is none; the message lists the names.
+        If there is no such parameter; the message lists the names.
     """
-    parameter = lookup_parameter(system, name)
+    parameter = find_parameter_or_none(system, name)
     if parameter is None:
         names = ", ".join(named_parameters(system))
         raise InputError(
@@ -209,27 +172,28 @@ def find_parameter(system: System, name: str) -> NamedParameter:
     return parameter
 
 
-def lookup_parameter(system: System, name: str) -> NamedParameter | None:
-    """Return the parameter with a name, or with the path of one of its arrays in the system; None if there is none."""
-    by_name, by_path = _parameters_by_name_and_by_path(system)
-    return by_name.get(name) or by_path.get(name)
+def find_parameter_or_none(system: System, name: str) -> NamedParameter | None:
+    """Return the parameter with a name, or with the path of one of its arrays; None if the system has none."""
+    parameters_by_name, parameters_by_path = _parameters_by_name_and_by_path(system)
+    return parameters_by_name.get(name) or parameters_by_path.get(name)
 
 
-def _check_and_record_name(replaced: dict[int, str], name: str, parameter: NamedParameter) -> None:
-    """Raise InputError if the parameter was given before under another name; otherwise record its name."""
-    for i in parameter.leaves:
-        if i in replaced:
-            raise InputError(f"{name} and {replaced[i]} are the same parameter. Give one of them")
-        replaced[i] = name
+def _record_name_of_leaves(names_by_leaf: dict[int, str], name: str, parameter: NamedParameter) -> None:
+    """Record the name under which the user gave a parameter; raise InputError if another name gave it before."""
+    for i in parameter.leaf_indices:
+        if i in names_by_leaf:
+            raise InputError(f"{name} and {names_by_leaf[i]} are the same parameter. Give one of them")
+        names_by_leaf[i] = name
 
 
 @memoize
 def _parameters_by_name_and_by_path(system: System) -> tuple[dict[str, NamedParameter], dict[str, NamedParameter]]:
-    """Return the parameters of a system by name, and by the paths of their arrays."""
-    flat, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(system, eqx.is_inexact_array))
-    fields = [[jax.tree_util.keystr((key,)).removeprefix(".") for key in path] for path, _ in flat]
-    paths = [jax.tree_util.keystr(path).removeprefix(".") for path, _ in flat]
+    """Return two dicts of the parameters of a system: by name, and by the paths of their arrays."""
+    paths_and_leaves, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(system, eqx.is_inexact_array))
+    fields = [[jax.tree_util.keystr((key,)).removeprefix(".") for key in path] for path, _ in paths_and_leaves]
+    paths = [jax.tree_util.keystr(path).removeprefix(".") for path, _ in paths_and_leaves]
     arrays, has_derived_energy = parameter_arrays(system), _has_derived_energy(fields)
+    conditions = [_condition_at(system, path) for path, _ in paths_and_leaves]
     leaves_by_name: dict[str, list[int]] = {}
     for i, path_fields in enumerate(fields):
         is_of_lagrangian = "lagrangian" in path_fields
@@ -238,52 +202,55 @@ def _parameters_by_name_and_by_path(system: System) -> tuple[dict[str, NamedPara
             is_derived |= is_of_lagrangian or path_fields[0] == "energy"
         if arrays[i].size and not is_derived:
             leaves_by_name.setdefault(_public_name(path_fields), []).append(i)
-    by_name: dict[str, NamedParameter] = {}
+    parameters_by_name: dict[str, NamedParameter] = {}
     for name, leaves in leaves_by_name.items():
         value = arrays[leaves[0]]
         if all(np.array_equal(arrays[i], value, equal_nan=True) for i in leaves):
-            by_name[name] = NamedParameter(value, tuple(leaves))
+            condition = next((conditions[i] for i in leaves if conditions[i] is not None), None)
+            parameters_by_name[name] = NamedParameter(value, tuple(leaves), condition=condition)
         else:  # different parameters, whose paths differ in the fields of wrappers only
-            by_name |= {paths[i]: NamedParameter(arrays[i], (i,)) for i in leaves}
-    by_path = {paths[i]: parameter for parameter in by_name.values() for i in parameter.leaves}
-    return _with_inertia(system, by_name, by_path), by_path
+            parameters_by_name |= {paths[i]: NamedParameter(arrays[i], (i,), condition=conditions[i]) for i in leaves}
+    parameters_by_path = {
+        paths[i]: parameter for parameter in parameters_by_name.values() for i in parameter.leaf_indices
+    }
+    return _replace_energy_matrix_by_inertia(system, parameters_by_name, parameters_by_path), parameters_by_path
 
 
-def _has_derived_energy(fields: list[list[str]]) -> bool:
+def _has_derived_energy(field_paths: list[list[str]]) -> bool:
     """Return whether the energy was computed from the Lagrangian of a system, so that neither can be set alone."""
-    has_lagrangian = any(path[0] == "lagrangian" for path in fields)
-    return has_lagrangian and not any(path[0] == "energy" and "lagrangian" in path for path in fields)
+    has_lagrangian = any(path[0] == "lagrangian" for path in field_paths)
+    return has_lagrangian and not any(path[0] == "energy" and "lagrangian" in path for path in field_paths)
 
 
-def _public_name(fields: list[str]) -> str:
-    """Return the name of an array of a system from the fields of its path."""
-    if "lagrangian" in fields:
-        fields = fields[len(fields) - 1 - fields[::-1].index("lagrangian") :]
-    elif fields[:2] in (["energy", "baths"], ["baths", "energy"]):
+def _public_name(path_fields: list[str]) -> str:
+    """Return the name that users write for an array of a system, from the fields on its path."""
+    if "lagrangian" in path_fields:
+        path_fields = path_fields[len(path_fields) - 1 - path_fields[::-1].index("lagrangian") :]
+    elif path_fields[:2] in (["energy", "baths"], ["baths", "energy"]):
         # a bath of infinite capacity has the linear energy T S
-        fields = ["baths", *("temperature" if field == "b" else field for field in fields[2:])]
-    name = previous = fields[0]
-    for field in (*(f for f in fields[1:-1] if f not in WRAPPER_FIELDS), *fields[1:][-1:]):
-        if field != previous:  # not the friction of a friction
-            name += field if field.startswith("[") else f".{field}"
-        previous = field
+        path_fields = ["baths", *("temperature" if field_name == "b" else field_name for field_name in path_fields[2:])]
+    name = previous_field = path_fields[0]
+    for field_name in (*(f for f in path_fields[1:-1] if f not in WRAPPER_FIELDS), *path_fields[1:][-1:]):
+        if field_name != previous_field:  # not the friction of a friction
+            name += field_name if field_name.startswith("[") else f".{field_name}"
+        previous_field = field_name
     return name
 
 
-def _with_inertia(
-    system: System, by_name: dict[str, NamedParameter], by_path: dict[str, NamedParameter]
+def _replace_energy_matrix_by_inertia(
+    system: System, parameters_by_name: dict[str, NamedParameter], parameters_by_path: dict[str, NamedParameter]
 ) -> dict[str, NamedParameter]:
-    """Return the parameters with ``energy.inertia`` in place of the matrix of the energy of a rigid body.
+    """Return the parameters by name; for a rigid body, ``energy.inertia`` replaces the energy matrix ``energy.A``.
 
-    The matrix keeps its name as a path.
+    The matrix is added to ``parameters_by_path``.
     """
-    matrix = by_name.get("energy.A")
+    matrix = parameters_by_name.get("energy.A")
     if matrix is None or matrix.value.shape not in ((3,), (3, 3)) or system.inertia is None:
-        return by_name
+        return parameters_by_name
     body = system.drop_baths()
     if not isinstance(body.energy, Quadratic) or body.dim != 3:
-        return by_name
-    by_path["energy.A"] = matrix
+        return parameters_by_name
+    parameters_by_path["energy.A"] = matrix
     inverse = 1.0 / matrix.value if matrix.value.ndim == 1 else np.linalg.inv(matrix.value)
-    inertia = NamedParameter(inverse, matrix.leaves, is_inverse=True)
-    return {"energy.inertia": inertia, **{name: p for name, p in by_name.items() if name != "energy.A"}}
+    inertia = NamedParameter(inverse, matrix.leaf_indices, is_inverse=True, condition=INERTIA_CONDITION)
+    return {"energy.inertia": inertia, **{name: p for name, p in parameters_by_name.items() if name != "energy.A"}}

@@ -36,8 +36,10 @@ VALUES_PER_BLOCK = 1 << 15
 
 
 def threefry(key, counter) -> tuple[np.ndarray, np.ndarray]:
-    """Return two words of 32 random bits for each pair of a key and a counter; keys and counters are pairs of words
-    that broadcast."""
+    """Return two words of 32 random bits for each key and counter, by the cipher Threefry-2x32.
+
+    Keys and counters are pairs of arrays of uint32, whose shapes broadcast.
+    """
     words = (*key, PARITY ^ key[0] ^ key[1])
     x, y = counter[0] + words[0], counter[1] + words[1]
     for group in range(5):
@@ -64,31 +66,31 @@ def derive_key(key, *counters) -> tuple[np.ndarray, np.ndarray]:
     return key
 
 
-def split_words(numbers) -> tuple[np.ndarray, np.ndarray]:
+def high_and_low_words(integers) -> tuple[np.ndarray, np.ndarray]:
     """Return the high and low 32 bits of 64-bit integers, negative ones in two's complement."""
-    numbers = np.asarray(numbers).astype(np.int64).view(np.uint64)
-    return (numbers >> np.uint64(32)).astype(np.uint32), numbers.astype(np.uint32)
+    integers = np.asarray(integers).astype(np.int64).view(np.uint64)
+    return (integers >> np.uint64(32)).astype(np.uint32), integers.astype(np.uint32)
 
 
-def normal_numbers(key, steps: np.ndarray, count: int) -> np.ndarray:
-    """Return normal random numbers for each key and step, shape (keys, steps, count).
+def normal_numbers_of_steps(keys, step_counters: np.ndarray, n_numbers_per_step: int) -> np.ndarray:
+    """Return normal random numbers for each key and step, shape (keys, steps, n_numbers_per_step).
 
     Parameters
     ----------
-    key : two arrays of uint32, shape (keys,)
-    steps : array of uint32, shape (steps,)
-        The counters of the steps.
-    count : int
-        Normal numbers of a step.
+    keys : two arrays of uint32, shape (keys,)
+    step_counters : array of uint32, shape (steps,)
+    n_numbers_per_step : int
     """
-    numbers = np.empty((len(key[0]), len(steps), count))
-    value_indices = np.arange(count, dtype=np.uint32)
-    steps_per_block = max(1, VALUES_PER_BLOCK // max(count, 1))
-    keys_per_block = max(1, steps_per_block // max(len(steps), 1))
+    numbers = np.empty((len(keys[0]), len(step_counters), n_numbers_per_step))
+    value_indices = np.arange(n_numbers_per_step, dtype=np.uint32)
+    steps_per_block = max(1, VALUES_PER_BLOCK // max(n_numbers_per_step, 1))
+    keys_per_block = max(1, steps_per_block // max(len(step_counters), 1))
     for i in range(0, len(numbers), keys_per_block):
-        keys = key[0][i : i + keys_per_block, None, None], key[1][i : i + keys_per_block, None, None]
-        for start in range(0, len(steps), steps_per_block):
-            high_words, low_words = threefry(keys, (steps[start : start + steps_per_block, None], value_indices))
+        block_keys = keys[0][i : i + keys_per_block, None, None], keys[1][i : i + keys_per_block, None, None]
+        for start in range(0, len(step_counters), steps_per_block):
+            high_words, low_words = threefry(
+                block_keys, (step_counters[start : start + steps_per_block, None], value_indices)
+            )
             bits = high_words.astype(np.uint64) << np.uint64(32) | low_words
             values = scipy.special.ndtri(((bits >> np.uint64(11)) + 0.5) * 2.0**-53)
             numbers[i : i + keys_per_block, start : start + steps_per_block] = values
@@ -155,9 +157,9 @@ class Fluctuations(metaclass=ListedType):
     first: int = 0
 
     def __post_init__(self):
-        _check_nonnegative("boltzmann", self.boltzmann)
+        _require_nonnegative_number("boltzmann", self.boltzmann)
         if self.temperature is not None:
-            _check_nonnegative("the temperature", self.temperature)
+            _require_nonnegative_number("the temperature", self.temperature)
         seeds = self.seeds
         for name, numbers, bits in (("seed", seeds, 63), ("first", [self.first], 31)):
             are_integers = all(isinstance(n, int | np.integer) and not isinstance(n, bool) for n in numbers)
@@ -177,7 +179,7 @@ class Fluctuations(metaclass=ListedType):
         return list(self.seed) if isinstance(self.seed, list | tuple | np.ndarray) else [self.seed]  # type: ignore[list-item]
 
     def grid_seeds(self, grid_indices: Sequence[np.ndarray]) -> np.ndarray:
-        """Return a seed for each point of a grid, shape (points,), from its ``grid_indices`` along the axes."""
+        """Return a seed for each point of a grid, shape (points,), from its ``grid_indices`` along each axis."""
         return grid_seeds(self.seeds[0], grid_indices)
 
     def of(self, i: int) -> Fluctuations:
@@ -196,10 +198,12 @@ class Fluctuations(metaclass=ListedType):
         self.method_with_noise(system, DEFAULT_NOISE_METHOD)
         points = system.samples(samples, seed, scale)
         density = None if self.density is None else make_energy(self.density, "the density")
-        residuals = evaluate_at_points(_noise_residuals, (system, density), points)
+        residuals = evaluate_at_points(_noise_and_measure_residuals, (system, density), points)
         is_finite = np.isfinite(residuals[MEASURE_ROW])
         if not is_finite.any():
-            raise InputError(f"energy or dissipation is not finite at any of the {len(points)} test points")
+            raise InputError(
+                f"energy or dissipation is not finite at any of the {len(points)} test points. Give another scale="
+            )
         rows = []
         for name, values in residuals.items():
             max_residual = float(values[is_finite].max())
@@ -224,28 +228,29 @@ class Fluctuations(metaclass=ListedType):
         density = None if self.density is None else make_energy(self.density, "the density")
         return stochastic_method(system, method, self.boltzmann, self.temperature, density)
 
-    def consecutive_increments(
-        self, increments: int, members: np.ndarray, first: int, steps: int, h: float
+    def increments_of_equal_steps(
+        self, n_increments: int, trajectory_numbers: np.ndarray, first_step: int, n_steps: int, h: float
     ) -> np.ndarray:
-        """Return increments of consecutive steps of size h of a run that begins at time 0, from step ``first`` on.
+        """Return Wiener increments, shape (trajectories, n_steps, n_increments), of equal steps of a run from time 0.
 
-        Shape (trajectories, steps, increments).
+        The ``n_steps`` steps of size h begin after ``first_step`` steps; ``trajectory_numbers`` selects trajectories.
         """
-        return self.increments(increments, members, (first + np.arange(steps)) * h, h, h)
+        return self.increments(n_increments, trajectory_numbers, (first_step + np.arange(n_steps)) * h, h, h)
 
     def increments(
         self, count: int, trajectories: np.ndarray, starts: np.ndarray, length: float, step: float
     ) -> np.ndarray:
         """Return increments of the Wiener processes in steps of one length, shape (trajectories, steps, count).
 
-        They depend on the seed, the trajectory, the start and the length of each step alone (:func:`step_time_codes`).
+        The increments depend only on the seed, the trajectory, the start and the length of each step:
+        see :func:`integer_codes_of_step_times`.
 
         Parameters
         ----------
         count : int
-            Wiener processes.
+            Number of Wiener processes.
         trajectories : array of int, shape (trajectories,)
-            Numbers of trajectories.
+            Numbers of the trajectories.
         starts : array, shape (steps,)
             The times at which the steps start.
         length : float, > 0
@@ -257,12 +262,16 @@ class Fluctuations(metaclass=ListedType):
             seeds, numbers = np.array(self.seeds), trajectories + self.first
         else:
             seeds, numbers = np.asarray(self.seeds)[trajectories], np.full(len(trajectories), self.first)
-        halvings, cells = step_time_codes(starts, length, step)
-        high_words, low_words = split_words(cells)
+        halvings, cells = integer_codes_of_step_times(starts, length, step)
+        high_words, low_words = high_and_low_words(cells)
         values = np.empty((len(trajectories), len(cells), count))
         for high_word in np.unique(high_words):
-            key = derive_key(_step_key(step_code(step), halvings, int(high_word)), split_words(seeds), (numbers, 0))
-            values[:, high_words == high_word] = normal_numbers(key, low_words[high_words == high_word], count)
+            key = derive_key(
+                _random_key_of_steps(integer_code_of_step_size(step), halvings, int(high_word)),
+                high_and_low_words(seeds),
+                (numbers, 0),
+            )
+            values[:, high_words == high_word] = normal_numbers_of_steps(key, low_words[high_words == high_word], count)
         return np.sqrt(length) * np.clip(values, -MAX_STANDARD_DEVIATIONS, MAX_STANDARD_DEVIATIONS)
 
 
@@ -275,40 +284,40 @@ as possible from all simple fractions. In a run that starts at a simple fraction
 of a cell, where rounding would decide between two cells."""
 
 
-def step_time_codes(starts, length: float, step: float) -> tuple[int, np.ndarray]:
+def integer_codes_of_step_times(step_starts, step_length: float, run_step: float) -> tuple[int, np.ndarray]:
     """Return integers that identify steps by their times: one for their length, and one for each start, shape (steps,).
 
-    Times are counted in units of the ``step`` of the run. If the run starts at a multiple of it, the starts are
+    Times are counted in units of ``run_step``. If the run starts at a multiple of it, the starts are
     integers up to rounding. Each start is assigned to a cell, 64 cells per step, whose edges are far from integers and
     simple fractions. So a start that is rounded differently, such as ``0.1 * 13`` for ``1.0 + 0.1 * 3``, is in the same
     cell, as long as the rounding of times is below 1/200 of a step. For shorter steps the cells are halved, as often as
     the first integer says. So no two steps of a path have the same integers.
     """
-    halvings = 1 - math.frexp(2.0 * CELL_EDGE_FRACTION * length / step)[1]
-    cells = np.floor(np.asarray(starts) / step * (CELLS_PER_STEP * 2.0**halvings) + CELL_EDGE_FRACTION)
+    halvings = 1 - math.frexp(2.0 * CELL_EDGE_FRACTION * step_length / run_step)[1]
+    cells = np.floor(np.asarray(step_starts) / run_step * (CELLS_PER_STEP * 2.0**halvings) + CELL_EDGE_FRACTION)
     return halvings, cells.astype(np.int64)
 
 
-def step_code(step: float) -> int:
-    """Return an integer that identifies the step of a run by its first 32 bits, rounded where few numbers lie halfway.
+def integer_code_of_step_size(step_size: float) -> int:
+    """Return an integer that identifies the step size of a run by the first 32 bits of its mantissa and its exponent.
 
     Steps such as ``(t1 - t0) / 10``, which differ in their last bits, have equal codes.
     """
-    mantissa, exponent = math.frexp(step)
+    mantissa, exponent = math.frexp(step_size)
     return (exponent << 31) + math.floor((mantissa - 0.5) * 2.0**32 + CELL_EDGE_FRACTION)
 
 
 @functools.lru_cache(256)
-def _step_key(code: int, halvings: int, high_word: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the key of all steps whose cells have this high word, two arrays of shape (1,)."""
-    return derive_key(split_words([0]), split_words([code]), ([halvings], [high_word]))
+def _random_key_of_steps(run_step_code: int, halvings: int, high_word: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the key of the generator for all steps whose time cells have this high word, two arrays of shape (1,)."""
+    return derive_key(high_and_low_words([0]), high_and_low_words([run_step_code]), ([halvings], [high_word]))
 
 
 MEASURE_ROW = "the motion keeps the measure"
 """Name of the row of a report on the conservation of the measure."""
 
 
-def _noise_residuals(model: tuple[System, Energy | None], x):
+def _noise_and_measure_residuals(model: tuple[System, Energy | None], x):
     system, density = model
 
     def motion(y):
@@ -331,27 +340,32 @@ class NoisePaths:
     trajectory_numbers: np.ndarray
     schedule: StepSchedule
 
-    def step_increments(self, members: slice | np.ndarray, first_step: int, steps: int, h) -> np.ndarray:
-        """Return the Wiener increments of steps of size h that follow the first ``first_step`` steps of the run."""
-        starts = self.schedule.times_after(first_step + np.arange(steps))
+    def step_increments(self, members: slice | np.ndarray, first_step: int, n_steps: int, h) -> np.ndarray:
+        """Return the Wiener increments of steps ``first_step`` to ``first_step + n_steps - 1``, all of size h.
+
+        The shape is (members, n_steps, n_increments).
+        """
+        starts = self.schedule.times_after(first_step + np.arange(n_steps))
         return self.noise.increments(
             self.n_increments, self.trajectory_numbers[members], starts, float(h), self.schedule.h
         )
 
 
-def check_noise(noise, members: int = 1) -> None:
-    """Raise InputError unless ``noise`` is None, or Fluctuations with one seed for all members or one for each."""
+def check_noise(noise, n_trajectories: int = 1) -> None:
+    """Raise InputError unless ``noise`` is None, or Fluctuations with one seed for all trajectories or one for each."""
     if noise is not None and not isinstance(noise, Fluctuations):
         raise InputError(f"noise must be lt.Fluctuations(boltzmann, seed), got {noise!r}")
-    if noise is not None and len(noise.seeds) not in (1, members):
-        raise InputError(f"noise has {len(noise.seeds)} seeds for {members} trajectories. Give one seed, or one each")
+    if noise is not None and len(noise.seeds) not in (1, n_trajectories):
+        raise InputError(
+            f"noise has {len(noise.seeds)} seeds for {n_trajectories} trajectories. Give one seed, or one each"
+        )
 
 
 DEFAULT_NOISE_METHOD = MetriplecticMidpoint()
 """Default method of runs with noise."""
 
 
-def _check_nonnegative(name: str, value) -> None:
+def _require_nonnegative_number(name: str, value) -> None:
     try:
         number = float(value)
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""Preparation of a run: the system and the method as the engines run them, the initial state, and the promised laws."""
+"""Preparation of a run: the system and method in the form of the engines, the initial state, and the promised laws."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from ..systems import (
     make_autonomous,
 )
 from ..systems.clock import WORK_NAME
-from ..systems.invariants import recorded_functions_with_verdicts, resolve_invariants_near, undecided_functions
+from ..systems.invariants import recorded_functions_with_verdicts, resolve_invariants_near, undecided_function_names
 from ..systems.transport import has_generator
 from ..tracing.caching import LRUCache, memoize
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
@@ -39,17 +39,19 @@ from .system_family import Family
 
 Result = TypeVar("Result")
 
-REFERENCE_STEPS = (
+REFERENCE_OPTIONS_MESSAGE = (
     "Reference chooses its own steps and cannot be combined with Adaptive, save_at, until or dense. Use another method"
 )
 """Error message for options that need steps of the library's own methods."""
 
-NOISY_STEPS = "noise= needs fixed steps and cannot be combined with Adaptive, until or dense. Give the step as a number"
+NOISE_OPTIONS_MESSAGE = (
+    "noise= needs fixed steps and cannot be combined with Adaptive, until or dense. Give the step as a number"
+)
 """Error message for options that a run with noise does not have."""
 
 
 def refuse_tracers(function: Callable[..., Result]) -> Callable[..., Result]:
-    """Decorate a function that needs numbers: it refuses traced arguments by an InputError that names ``lt.flow``."""
+    """Return a function that raises an InputError, which names ``lt.flow``, if JAX traces its arguments."""
 
     @functools.wraps(function)
     def call(*arguments, **keywords) -> Result:
@@ -66,55 +68,56 @@ def refuse_tracers(function: Callable[..., Result]) -> Callable[..., Result]:
     return call
 
 
-def check_choice(name: str, value, choices: tuple[str, ...]) -> None:
+def check_choice(argument_name: str, value, choices: tuple[str, ...]) -> None:
     if value not in choices:
         *leading_choices, last_choice = map(repr, choices)
-        raise InputError(f"{name} must be {', '.join(leading_choices)} or {last_choice}, got {value!r}")
+        raise InputError(f"{argument_name} must be {', '.join(leading_choices)} or {last_choice}, got {value!r}")
 
 
-def checked_or_default_method(method, noise: Fluctuations | None = None, *, runs_alone: bool = False) -> Any:
+def checked_or_default_method(method, noise: Fluctuations | None = None, *, is_single_trajectory: bool = False) -> Any:
     """Return the method of a run, the default one for None.
 
     Raises
     ------
     InputError
-        If it is not a method, or the method is Reference and the run is not one of a single trajectory
-        (``runs_alone``).
+        If ``method`` is not a method, or is Reference and the run is not ``is_single_trajectory``.
     """
     if method is None:
         return DEFAULT_METHOD if noise is None else DEFAULT_NOISE_METHOD
     if not isinstance(method, OneStepMethod | Reference):
         raise InputError(f"method must be an integrator such as lt.MetriplecticGauss(), got {method!r}")
-    if isinstance(method, Reference) and not runs_alone:
+    if isinstance(method, Reference) and not is_single_trajectory:
         raise InputError("Reference runs single trajectories, with lt.integrate or a propagator. Use another method")
     return method
 
 
-def check_steps(method, step, noise: Fluctuations | None, until=None, dense: bool = False, save_at=None) -> None:
-    """Raise InputError if the method or the noise of a run cannot be combined with its step or its other options."""
+def refuse_incompatible_options(
+    method, step, noise: Fluctuations | None, until=None, dense: bool = False, save_at=None
+) -> None:
+    """Raise InputError if Reference or noise is combined with adaptive steps, events, dense output or ``save_at``."""
     is_examined = isinstance(step, Adaptive) or until is not None or dense
     if isinstance(method, Reference) and (is_examined or save_at is not None):
-        raise InputError(REFERENCE_STEPS)
+        raise InputError(REFERENCE_OPTIONS_MESSAGE)
     if noise is not None and is_examined:
-        raise InputError(NOISY_STEPS)
+        raise InputError(NOISE_OPTIONS_MESSAGE)
 
 
 def resolve_invariants(system: System, x0) -> System:
-    """Return the system with undecided conservation laws decided at states near x0."""
+    """Return the system after testing its undecided conservation laws at states near x0."""
     return resolve_invariants_near(system, system.state_array(x0, True)) if has_undecided_invariants(system) else system
 
 
 @memoize
 def has_undecided_invariants(system: System) -> bool:
-    """Return whether what the system conserves has to be decided near the initial state of a run."""
-    return not is_traced(system) and bool(undecided_functions(system))
+    """Return whether some conservation laws of the system must be tested near the initial state of a run."""
+    return not is_traced(system) and bool(undecided_function_names(system))
 
 
 @memoize
 def prepare_system_and_method(
-    system: System, method, noise: Fluctuations | None = None, tolerance: float | None = None
+    system: System, method, noise: Fluctuations | None = None, adaptive_tolerance: float | None = None
 ) -> tuple[System, Any]:
-    """Return the system and the method as they are run, for a tolerance of adaptive steps or for fixed steps.
+    """Return the system and the method in the form of the engines, for adaptive steps of a tolerance or fixed steps.
 
     They include clock and work for a driven system, noise, the attitude if there is a group, and charts or the
     embedding of a manifold.
@@ -129,20 +132,23 @@ def prepare_system_and_method(
             )
         return make_autonomous(system, unit=1.0), method  # its errors are measured component by component
     method = method if noise is None else noise.method_with_noise(make_autonomous(system), method)
-    return prepare_for_method(system, method, tolerance, True)
+    return prepare_for_method(system, method, adaptive_tolerance, True)
 
 
 @memoize
 def prepare_for_method(
-    system: System, method: OneStepMethod, tolerance: float | None = None, attitude: bool = False
+    system: System, method: OneStepMethod, adaptive_tolerance: float | None = None, with_attitude: bool = False
 ) -> tuple[System, OneStepMethod]:
-    """Return the system and the method as they are run, with an attitude if wanted or needed by a torque."""
+    """Return the system and a method of the library in the form of the engines, without noise.
+
+    They include the attitude if ``with_attitude`` is True or a torque depends on it.
+    """
     autonomous_system = make_autonomous(system if method.uses_charts else embed_in_arrays(system))
     method = trace_energies(
-        pullback_method(method, autonomous_system).on(autonomous_system, tolerance), autonomous_system.dim
+        pullback_method(method, autonomous_system).on(autonomous_system, adaptive_tolerance), autonomous_system.dim
     )
     reconstruction = system.reconstruction if isinstance(system, LiePoissonSystem) else None
-    if reconstruction is None or not (attitude or system.torque_laws.needs_attitude):
+    if reconstruction is None or not (with_attitude or system.torque_laws.needs_attitude):
         return autonomous_system, method
     assert isinstance(autonomous_system, LiePoissonSystem | DrivenSystem)
     kind = "exp" if method.explicit else reconstruction
@@ -164,19 +170,19 @@ def checked_initial_state(system: System, method, x0, t: float, attitude=None) -
 
 
 def why_not_startable(system: System, method, x) -> str:
-    """Return why no run can start at x, a state or a batch of states; "" if it can."""
+    """Return the reason why no run can start at x, a state or a batch of states; "" if a run can start."""
     ignores_singularity = has_generator(system) and (not isinstance(method, OneStepMethod) or method.explicit)
     domain = system.domain
     reason = domain.why_outside(x) or ("" if ignores_singularity else domain.why_singular(x))
     return reason and f"the run cannot start at this x0: {reason}"
 
 
-def wrap_family(family: Family, system: System) -> Family:
-    """Return the family with each member wrapped as ``system`` wraps one of them."""
-    if system.wrapped_system is None:
+def wrap_family_like_member(family: Family, wrapped_member: System) -> Family:
+    """Return the family with each member wrapped as ``wrapped_member`` is: by a clock, an attitude or an embedding."""
+    if wrapped_member.wrapped_system is None:
         return family
-    return wrap_family(family, system.wrapped_system.system).map_members(
-        system.wrapped_system.wrap, *system.wrapped_system.arguments
+    return wrap_family_like_member(family, wrapped_member.wrapped_system.system).map_members(
+        wrapped_member.wrapped_system.wrap, *wrapped_member.wrapped_system.arguments
     )
 
 
@@ -186,15 +192,15 @@ MAX_LIMITED_SYSTEMS = 64
 _limited_systems: LRUCache[tuple[System, System]] = LRUCache(MAX_LIMITED_SYSTEMS)
 
 
-def limit_to_span(system: System, schedule: StepSchedule) -> System:
+def limit_time_functions_to_span(system: System, schedule: StepSchedule) -> System:
     """Return the prepared system with its functions of time evaluated only at times within the span of a schedule.
 
-    At the breaks within the span functions of time may jump. Equal arguments return the same object, so that cached
+    These functions may jump at the breaks within the span. Equal arguments return the same object, so that cached
     results are shared.
     """
     if system.clock is None:
         return system
-    span = *schedule.function_span, *schedule.breaks
+    span = *schedule.span_of_time_functions, *schedule.breaks
     if is_traced(system):
         return set_time_span(system, *span)
     # the value holds the system, so that its id stays its own
@@ -202,16 +208,16 @@ def limit_to_span(system: System, schedule: StepSchedule) -> System:
     return _limited_systems.get_or_compute(key, lambda: (system, set_time_span(system, *span)))[1]
 
 
-def limit_family_to_span(family: Family, system: System, schedule: StepSchedule) -> Family:
-    """Return the family with each member limited to the span of a schedule; ``system`` is one of the members."""
-    if system.clock is None:
+def limit_time_functions_of_family(family: Family, example_member: System, schedule: StepSchedule) -> Family:
+    """Return the family with the functions of time of each member evaluated only within the span of a schedule."""
+    if example_member.clock is None:
         return family
-    return family.map_members_with_shared_numbers(set_time_span, *schedule.function_span, *schedule.breaks)
+    return family.map_members_with_shared_numbers(set_time_span, *schedule.span_of_time_functions, *schedule.breaks)
 
 
 @memoize
 def invariants_and_laws(system: System, method) -> tuple[dict, Laws]:
-    """Return the invariants recorded along a run and the laws promised for it.
+    """Return the functions recorded as invariants along a run, by name with verdicts, and the promised laws.
 
     Raises
     ------
@@ -222,25 +228,25 @@ def invariants_and_laws(system: System, method) -> tuple[dict, Laws]:
         method.check(system)
         if not is_library_object(method):
             check_shapes_of_method(system, method)
-    recorded = recorded_functions_with_verdicts(system)
-    return recorded, promised_laws(system, method, recorded)
+    invariants = recorded_functions_with_verdicts(system)
+    return invariants, promised_laws(system, method, invariants)
 
 
 def check_shapes_of_method(system: System, method: OneStepMethod) -> None:
-    """Trace one step of a user's method, as the engines will, and check the shapes of its slopes and of its increment.
+    """Trace the slopes and the increment of a user's method, and check that they have the shapes of slopes and state.
 
     Raises
     ------
     FunctionError
-        If a member cannot be traced, at the line of the method, or returns another shape.
+        If ``slopes`` or ``increment`` cannot be traced, with the line of the method, or returns another shape.
     """
     x, h = jax.ShapeDtypeStruct((system.dim,), np.float64), jax.ShapeDtypeStruct((), np.float64)
     k = jax.ShapeDtypeStruct((method.stages, system.dim), np.float64)
-    members: dict[str, tuple[Callable, tuple, tuple[int, ...]]] = {
+    functions_to_trace: dict[str, tuple[Callable, tuple, tuple[int, ...]]] = {
         "slopes": (lambda x, h, k: method.slopes(system, x, 0.0 * x, h, k), (x, h, k), k.shape),
         "increment": (method.increment, (h, k), x.shape),
     }
-    for name, (function, arguments, shape) in members.items():
+    for name, (function, arguments, shape) in functions_to_trace.items():
         try:
             result = jax.eval_shape(function, *arguments)
         except TRACE_ERRORS as error:
@@ -252,9 +258,12 @@ def check_shapes_of_method(system: System, method: OneStepMethod) -> None:
 
 
 def promised_laws(system: System, method, invariants) -> Laws:
-    """Return the laws that the system promises and, of its invariants, those that the method preserves."""
+    """Return the laws promised for a run: energy, entropy, and the invariants that the method preserves."""
     method_preserves = method.preserves_function if isinstance(method, OneStepMethod) else lambda system, name: False
-    constants = [*(name for name, (_, is_conserved) in invariants.items() if is_conserved), *system.constant_names]
+    constants = [
+        *(name for name, (_, is_conserved) in invariants.items() if is_conserved),
+        *system.vector_invariant_names,
+    ]
     unknown = tuple(name for name, (_, is_conserved) in invariants.items() if is_conserved is None)
     conserved_names = tuple(name for name in constants if method_preserves(system, name))
     unpromised_names = tuple(name for name in constants if name not in conserved_names)

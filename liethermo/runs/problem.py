@@ -1,4 +1,4 @@
-"""``Problem``: what the user gave as it is run, with what all its runs share."""
+"""``Problem``: a system and a method in the form of the engines, with the laws and engines that all runs share."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .noise import Fluctuations
 from .preparation import (
     checked_initial_state,
     invariants_and_laws,
-    limit_to_span,
+    limit_time_functions_to_span,
     prepare_system_and_method,
     resolve_invariants,
 )
@@ -26,14 +26,14 @@ from .solution_builder import RecordedFunctions
 
 
 class Problem:
-    """A system and a method as they are run, with the laws and the engines of all their runs.
+    """A system and a method in the form of the engines, with the laws and the engines of all their runs.
 
     Attributes
     ----------
     system : System
-        The user's system with a clock, an attitude, and charts or an embedding, as far as it needs them.
+        The user's system, with a clock, an attitude, and charts or an embedding if it needs them.
     method : OneStepMethod or Reference
-        The user's method, with noise and reconstruction as far as the system needs them.
+        The user's method, with noise and reconstruction if the system needs them.
     noise : Fluctuations or None
     functions : RecordedFunctions
     laws : Laws
@@ -56,7 +56,9 @@ class Problem:
         self.state_shape = system.shape if system.sites else (system.dim,)
         kind = type(system)
         self.has_fixed_domain = system.space is None and system.domain.allows_every_start
-        self.starts_anywhere = self.has_fixed_domain and system.inner is None and kind.state_array is System.state_array
+        self.starts_anywhere = (
+            self.has_fixed_domain and system.inner_system is None and kind.state_array is System.state_array
+        )
 
     @classmethod
     def from_user(
@@ -64,19 +66,19 @@ class Problem:
         system: System,
         method: OneStepMethod | Reference,
         noise: Fluctuations | None = None,
-        tolerance: float | None = None,
+        adaptive_tolerance: float | None = None,
         x0=None,
     ) -> Problem:
-        """Return the problem of a system and a method, for a tolerance of adaptive steps or for fixed steps.
+        """Return the cached problem of a system and a method, for adaptive steps of a tolerance or for fixed steps.
 
-        What the system conserves is decided at states near x0, if it is not decided by construction.
+        Conservation laws that do not hold by construction are tested at states near x0.
 
         Raises
         ------
         InputError
             If the method cannot run the system.
         """
-        return _cached_problem(resolve_invariants(system, x0), method, noise, tolerance)
+        return _cached_problem(resolve_invariants(system, x0), method, noise, adaptive_tolerance)
 
     def initial_state(self, x0, t: float, attitude=None) -> np.ndarray | jax.Array:
         """Return the initial state from the user's x0, shape (n,), after checking that a run can start there.
@@ -92,15 +94,14 @@ class Problem:
                 return x
         return checked_initial_state(self.system, self.method, x0, t, attitude)
 
-    def system_in_span(self, schedule: StepSchedule) -> System:
-        """Return the system with its functions of time evaluated within the span of a schedule only."""
-        return limit_to_span(self.system, schedule) if self.is_driven else self.system
+    def system_limited_to_span(self, schedule: StepSchedule) -> System:
+        """Return the system with its functions of time evaluated only at times within the span of a schedule."""
+        return limit_time_functions_to_span(self.system, schedule) if self.is_driven else self.system
 
-    def engine(
+    def engine_of_run(
         self, requested_engine: str, system: System, planned_steps: int, noise_increments: Callable | None = None
     ) -> EngineWithFallback:
-        """Return an engine for a run in this thread: a shared one, or a new one if the run depends on its time span
-        or noise path.
+        """Return an engine for a run in this thread; runs that do not depend on time or noise share engines.
 
         Parameters
         ----------
@@ -116,21 +117,21 @@ class Problem:
         if self.is_driven or noise_increments is not None:
             return EngineWithFallback(system, self.method, requested_engine, planned_steps, noise_increments)
         key = requested_engine, planned_steps >= MIN_STEPS_TO_COMPILE
-        engine = self._engines.by_request.get(key)
+        engine = self._engines.engines_by_request.get(key)
         if engine is None or engine.has_fallen_back:  # the next run tries again, and warns again
-            engine = self._engines.by_request[key] = EngineWithFallback(
+            engine = self._engines.engines_by_request[key] = EngineWithFallback(
                 system, self.method, requested_engine, planned_steps
             )
         return engine
 
 
 class _ThreadEngines(threading.local):
-    """Engines of one thread, whose buffers no other thread may use."""
+    """Engines of the current thread, whose buffers no other thread may use."""
 
     def __init__(self):
-        self.by_request: dict[tuple[str, bool], EngineWithFallback] = {}
+        self.engines_by_request: dict[tuple[str, bool], EngineWithFallback] = {}
 
 
 @memoize
-def _cached_problem(system: System, method, noise: Fluctuations | None, tolerance: float | None) -> Problem:
-    return Problem(*prepare_system_and_method(system, method, noise, tolerance), noise)
+def _cached_problem(system: System, method, noise: Fluctuations | None, adaptive_tolerance: float | None) -> Problem:
+    return Problem(*prepare_system_and_method(system, method, noise, adaptive_tolerance), noise)

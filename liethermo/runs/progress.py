@@ -42,9 +42,12 @@ class Progress:
             self.task = bar.add_task(self.text_format.format(self.span[0]), total=total)
         return self
 
-    def update(self, t: float) -> None:
+    def update(self, current_value: float) -> None:
+        """Move the bar to a value between the ends of the span."""
         if self.bar is not None:
-            self.bar.update(self.task, completed=t - self.span[0], description=self.text_format.format(t))
+            self.bar.update(
+                self.task, completed=current_value - self.span[0], description=self.text_format.format(current_value)
+            )
 
     def __exit__(self, *_):
         if self.bar is not None:

@@ -29,12 +29,18 @@ from .ensemble import ensemble
 from .events import Until
 from .named_parameters import replace_parameters
 from .noise import Fluctuations, check_noise
-from .preparation import check_choice, check_steps, checked_or_default_method, has_undecided_invariants, refuse_tracers
+from .preparation import (
+    check_choice,
+    checked_or_default_method,
+    has_undecided_invariants,
+    refuse_incompatible_options,
+    refuse_tracers,
+)
 from .problem import Problem
 from .progress import Progress
 from .run import Run
 from .schedule import CHUNK_STEPS, ScheduleSegment, StepSchedule, checked_span, checked_step, make_schedule
-from .time_features import schedule_around_features
+from .time_features import add_breaks_at_features_or_warn
 from .varied_parameters import VariedParameters
 
 CONVERGENCE_FAILURES = tuple(
@@ -42,23 +48,23 @@ CONVERGENCE_FAILURES = tuple(
 )
 
 FinalStateFunction: TypeAlias = Callable[[Any], np.ndarray | None]
-"""A function from an initial state to the last state; its result is None where a run has to compute that."""
+"""A function from an initial state to the last state, or to None if the state has to be computed by a run."""
 
 MAX_CACHED_PARAMETER_SETS = 32
-"""Sets of parameters whose prepared propagators are held in memory, those last used."""
+"""Largest number of parameter sets whose propagators are cached; the least recently used are dropped."""
 
 
 MAX_CACHED_SCHEDULES = 32
-"""Schedules of steps that are held in memory, those last used."""
+"""Largest number of step schedules that are cached; the least recently used are dropped."""
 
 MAX_CACHED_SCHEDULE_STEPS = 10_000
-"""Largest number of steps of a schedule that is held in memory."""
+"""Largest number of steps of a schedule that is cached."""
 
-_schedules: LRUCache[StepSchedule] = LRUCache(MAX_CACHED_SCHEDULES)
+_cached_schedules: LRUCache[StepSchedule] = LRUCache(MAX_CACHED_SCHEDULES)
 
 
 class Propagator(metaclass=ListedType):
-    """A system, a method and a step, prepared once: for optimisers, samplers and control loops.
+    """Integrator of one system by one method and step, for many calls by optimisers, samplers and control loops.
 
     ``p(x0, t_span)`` returns what :func:`integrate` returns. ``p.final(x0, t_span)`` returns the last state alone,
     and goes straight to machine code where the compiled engine takes steps of one size. A propagator may be called from
@@ -105,14 +111,14 @@ class Propagator(metaclass=ListedType):
     ):
         if noise is not None:
             check_noise(noise)
-        method = checked_or_default_method(method, noise, runs_alone=True)
+        method = checked_or_default_method(method, noise, is_single_trajectory=True)
         require_system(system, "the first argument must be a system such as lt.LiePoissonSystem")
         check_choice("engine", engine, ENGINES)
-        check_steps(method, step, noise)
+        refuse_incompatible_options(method, step, noise)
         self.system, self.method, self.step, self.engine, self.noise = system, method, step, engine, noise
         self._variants: LRUCache[Propagator] = LRUCache(MAX_CACHED_PARAMETER_SETS)
         self._decided_problem: Problem | None = None
-        self._thread = _ThreadFunctions()
+        self._thread = _ThreadFinalStateFunctions()
 
     def __getstate__(self) -> tuple:
         return self.system, self.method, self.step, self.engine, self.noise
@@ -144,7 +150,7 @@ class Propagator(metaclass=ListedType):
         attitude=None,
         breaks: Sequence[float] = (),
     ) -> Solution:
-        """Return the solution from a state over a span of time.
+        """Integrate from the state x0 over a span of time, and return the solution.
 
         Parameters
         ----------
@@ -174,14 +180,14 @@ class Propagator(metaclass=ListedType):
             )
         check_choice("on_failure", on_failure, ("raise", "return"))
         step, adaptive = self.step, isinstance(self.step, Adaptive)
-        problem = self._problem(x0)
-        check_steps(self.method, step, self.noise, until, dense, save_at)
-        declared = self._declared_times if problem.is_driven else TIMES_OF_SMOOTH_FUNCTIONS
+        problem = self._problem_of_run_from(x0)
+        refuse_incompatible_options(self.method, step, self.noise, until, dense, save_at)
+        declared_times = self._declared_times if problem.is_driven else TIMES_OF_SMOOTH_FUNCTIONS
         allow_infinite_end = adaptive and until is not None
-        schedule = self._schedule(t_span, save_every, save_at, allow_infinite_end, breaks, declared)
+        schedule = self._cached_schedule(t_span, save_every, save_at, allow_infinite_end, breaks, declared_times)
         x = problem.initial_state(x0, schedule.start, attitude)
         if problem.is_driven and isinstance(self.method, OneStepMethod):
-            schedule = schedule_around_features(schedule, [problem.system_in_span(schedule)], [x], step)
+            schedule = add_breaks_at_features_or_warn(schedule, [problem.system_limited_to_span(schedule)], [x], step)
         run = Run(problem, x, schedule, save_to, self.engine, dense)
         with Progress((schedule.start, schedule.end), progress) as bar:
             if isinstance(self.method, Reference):
@@ -189,15 +195,15 @@ class Propagator(metaclass=ListedType):
             elif adaptive or until is not None:
                 run.run_adaptive_or_until_event(bar, step if adaptive else schedule.h, until)
             else:
-                run.run_fixed(bar)
+                run.run_fixed_steps(bar)
         solution = run.solution_so_far()
         if save_to is not None:
             try:
                 solution.save(save_to)
             except FileError as error:
-                raise FileError(f"{error}. It is the exception's .solution", solution) from error
+                raise FileError(f"{error}. The exception has this result as .solution", solution) from error
         if on_failure == "raise":
-            raise_failure(solution)
+            raise_if_failed(solution)
         return solution
 
     def final(self, x0, t_span: tuple[float, float], *, parameters: Mapping[str, Any] | None = None) -> np.ndarray:
@@ -218,7 +224,7 @@ class Propagator(metaclass=ListedType):
             As :func:`integrate` does.
         """
         if parameters:
-            x = self._final_state_with_parameters(x0, t_span, parameters)
+            x = self._compiled_final_state_with_parameters(x0, t_span, parameters)
             return self.with_parameters(parameters).final(x0, t_span) if x is None else x
         functions = self._thread.final_functions
         function = functions.get(t_span) if type(t_span) is tuple else None
@@ -254,10 +260,10 @@ class Propagator(metaclass=ListedType):
             **options,
         )
 
-    # -- what is prepared -----------------------------------------------------------------------------------------
+    # -- cached propagators, problems, schedules and programs -----------------------------------------------------
 
     def with_parameters(self, parameters: Mapping[str, Any]) -> Propagator:
-        """Return the propagator of the system with new values of some parameters.
+        """Return the cached propagator of the system with new values of some parameters.
 
         Raises
         ------
@@ -274,8 +280,8 @@ class Propagator(metaclass=ListedType):
             ),
         )
 
-    def _problem(self, x0=None) -> Problem:
-        """Return the problem of a run from x0; what the system conserves may be decided there."""
+    def _problem_of_run_from(self, x0=None) -> Problem:
+        """Return the problem of a run from x0, near which undecided conservation laws are tested."""
         if self._decided_problem is not None:
             return self._decided_problem
         tolerance = self.step.tolerance if isinstance(self.step, Adaptive) else None
@@ -286,53 +292,54 @@ class Propagator(metaclass=ListedType):
 
     @functools.cached_property
     def _declared_times(self) -> DeclaredTimes:
-        """Times at which functions of time of the system say that they are not smooth."""
+        """Times at which the functions of time in the system declare jumps and kinks."""
         return DeclaredTimes.from_tree(self.system)
 
-    def _schedule(
-        self, t_span, save_every: int, save_at, allow_infinite_end: bool, breaks, declared: DeclaredTimes
+    def _cached_schedule(
+        self, t_span, save_every: int, save_at, allow_infinite_end: bool, breaks, declared_times: DeclaredTimes
     ) -> StepSchedule:
-        """Return the schedule of a run; short ones that were used last, by any propagator, are cached."""
-        kind, has_breaks = type(self.step), any(declared) or not isinstance(breaks, tuple) or breaks
+        """Return the schedule of a run; all propagators share a cache of short schedules."""
+        kind, has_breaks = type(self.step), any(declared_times) or not isinstance(breaks, tuple) or breaks
         is_plain = save_at is None and not allow_infinite_end and not has_breaks and type(save_every) is int
         if not is_plain or kind not in (float, int, Adaptive):
-            return make_schedule(t_span, self.step, save_every, save_at, allow_infinite_end, breaks, declared)
+            return make_schedule(t_span, self.step, save_every, save_at, allow_infinite_end, breaks, declared_times)
         key = *checked_span(t_span), save_every, kind if kind is Adaptive else self.step
-        schedule = _schedules.get(key)
+        schedule = _cached_schedules.get(key)
         if schedule is None:
             schedule = make_schedule(key[:2], self.step, save_every)
             if schedule.n_steps <= MAX_CACHED_SCHEDULE_STEPS:
-                _schedules.get_or_compute(key, lambda: schedule)
+                _cached_schedules.get_or_compute(key, lambda: schedule)
         return schedule
 
     def _compiled_final_state_function(
-        self, t_span, varied: VariedParameters | None = None
+        self, t_span, varied_parameters: VariedParameters | None = None
     ) -> FinalStateFunction | None:
-        """Return the function from x0 to the last state of runs over a span, which machine code computes.
+        """Return a function from x0 to the last state over a span in machine code, or None if a run has to compute it.
 
-        The result is None where a run has to compute the last state, and that of the function where a run has to say
-        why a step fails.
+        The function returns None if a step fails; a run then says why.
 
         Parameters
         ----------
         t_span : (float, float)
-        varied : VariedParameters, optional
-            The function takes these parameters from it at each call.
+        varied_parameters : VariedParameters, optional
+            Parameters whose current values the function reads at each call.
         """
-        problem = self._problem_of_final
-        if problem is None or (varied is not None and not varied.is_program_determined_by_key(problem)):
+        problem = self._problem_of_compiled_final_states
+        if problem is None or (
+            varied_parameters is not None and not varied_parameters.is_program_determined_by_key(problem)
+        ):
             return None
         start, end = checked_span(t_span)
         h = checked_step(self.step, start, end)
         segment = ScheduleSegment.from_span(start, end, h)
         if segment.n_full_steps > CHUNK_STEPS:
             return None  # a run in portions, which Ctrl-C can stop
-        trajectory = problem.engine(self.engine, problem.system, segment.n_steps).compiled_trajectory(
-            varied is not None
+        trajectory = problem.engine_of_run(self.engine, problem.system, segment.n_steps).compiled_trajectory(
+            varied_parameters is not None
         )
         if trajectory is None:
             return None
-        compute = trajectory.final_state_function(segment.equal_steps(h))
+        compute = trajectory.final_state_function(segment.step_sizes_and_counts(h))
         state_shape, flat_shape, starts_anywhere = problem.state_shape, (problem.system.dim,), problem.starts_anywhere
 
         def final_state(x0) -> np.ndarray | None:
@@ -340,39 +347,47 @@ class Propagator(metaclass=ListedType):
             x = compute(x0 if is_state else np.asarray(problem.initial_state(x0, start)))
             return x if x is None or state_shape == flat_shape else x.reshape(state_shape)
 
-        if varied is None:
+        if varied_parameters is None:
             return final_state
 
         def final_state_with_parameters(x0) -> np.ndarray | None:
-            trajectory.parameters[varied.indices] = varied.entries
+            trajectory.parameters[varied_parameters.indices] = varied_parameters.entries
             return final_state(x0)
 
         return final_state_with_parameters
 
-    def _final_state_with_parameters(self, x0, t_span, parameters: Mapping[str, Any]) -> np.ndarray | None:
-        """Return the last state for new values of parameters by machine code that takes them as arguments.
+    def _compiled_final_state_with_parameters(self, x0, t_span, parameters: Mapping[str, Any]) -> np.ndarray | None:
+        """Return the last state for new parameter values, by machine code that takes the parameters as arguments.
 
-        None where a propagator of its own has to compute it, which tests anew what the system conserves.
+        The result is None if new values may change what the system conserves; a new propagator then has to compute the
+        state.
         """
         names, thread = tuple(parameters), self._thread
-        if names not in thread.varied:
+        if names not in thread.varied_parameters:
             self.with_parameters(parameters)  # which checks the names
-            thread.varied[names] = self._varied_parameters(names)
-        varied = thread.varied[names]
-        key = None if varied is None or type(t_span) is not tuple else varied.program_key(parameters.values())
-        if varied is None or key is None:
+            thread.varied_parameters[names] = self._varied_parameters_or_none(names)
+        varied_parameters = thread.varied_parameters[names]
+        key = (
+            None
+            if varied_parameters is None or type(t_span) is not tuple
+            else varied_parameters.set_values_and_get_program_key(parameters.values())
+        )
+        if varied_parameters is None or key is None:
             return None
         function = thread.final_functions.get((names, key, t_span))
         if function is None:
-            function = self.with_parameters(parameters)._compiled_final_state_function(t_span, varied) or _leave_to_run
+            function = (
+                self.with_parameters(parameters)._compiled_final_state_function(t_span, varied_parameters)
+                or _defer_final_state_to_run
+            )
             thread.add((names, key, t_span), function)
         return function(x0)
 
     @with_library_settings
-    def _varied_parameters(self, names: tuple[str, ...]) -> VariedParameters | None:
-        """Return parameters that are arguments of machine code; None where they may decide which code runs."""
-        problem = self._problem_of_final
-        if problem is None or not problem.has_fixed_domain or self.system.preserved:
+    def _varied_parameters_or_none(self, names: tuple[str, ...]) -> VariedParameters | None:
+        """Return the named parameters as arguments of machine code, or None if their values may change the program."""
+        problem = self._problem_of_compiled_final_states
+        if problem is None or not problem.has_fixed_domain or self.system.preserved_functions:
             return None
         try:
             return VariedParameters(self.system, self.method, names)
@@ -381,43 +396,43 @@ class Propagator(metaclass=ListedType):
 
     @functools.cached_property
     @with_library_settings
-    def _problem_of_final(self) -> Problem | None:
-        """The problem whose final states machine code computes; None where every call is a run."""
+    def _problem_of_compiled_final_states(self) -> Problem | None:
+        """Problem whose final states machine code can compute, or None if every call needs a run."""
         if isinstance(self.step, Adaptive) or self.noise is not None or isinstance(self.method, Reference):
             return None
         if has_undecided_invariants(self.system):  # what is conserved may depend on the initial state
             return None
-        problem = self._problem()
-        return problem if problem.system.inner is None else None
+        problem = self._problem_of_run_from()
+        return problem if problem.system.inner_system is None else None
 
 
-def _leave_to_run(x0) -> None:
-    """Return None, which says that no machine code computes the last state and a run has to."""
+def _defer_final_state_to_run(x0) -> None:
+    """Return None in place of a last state, so that the caller computes it by a run, because no program does."""
 
 
-class _ThreadFunctions(threading.local):
-    """Functions that compute final states over spans, in the buffers of one thread.
+class _ThreadFinalStateFunctions(threading.local):
+    """Cache of functions that compute final states over spans, for the current thread, whose buffers they use.
 
     Attributes
     ----------
     final_functions : dict
-        Keys are spans; with varied parameters their names, the key of the program, and the span.
-    varied : dict from names to VariedParameters or None
-        Parameters that were given to calls; None for those that machine code does not take as arguments.
+        Keys are spans; for functions of parameters, the names, the key of the program, and the span.
+    varied_parameters : dict from names to VariedParameters or None
+        Parameters of earlier calls; None for those that machine code does not take as arguments.
     """
 
     def __init__(self):
         self.final_functions: dict[tuple, FinalStateFunction] = {}
-        self.varied: dict[tuple[str, ...], VariedParameters | None] = {}
+        self.varied_parameters: dict[tuple[str, ...], VariedParameters | None] = {}
 
-    def add(self, key: tuple, function: FinalStateFunction) -> None:
+    def add(self, key: tuple, final_state_function: FinalStateFunction) -> None:
         if len(self.final_functions) >= MAX_CACHED_SCHEDULES:
             self.final_functions.clear()
-        self.final_functions[key] = function
+        self.final_functions[key] = final_state_function
 
 
-def raise_failure(solution: Solution) -> None:
-    """Raise the error of a run that failed; the run is its ``.solution``.
+def raise_if_failed(solution: Solution) -> None:
+    """Raise the error that belongs to the status of a failed run, with the run as its ``.solution``.
 
     Raises
     ------

@@ -28,10 +28,10 @@ from .events import EventSet, collect_events
 from .evidence import (
     MAX_LOCAL_ERROR_STEPS,
     MAX_SENSITIVITY_STATES,
-    GroupEvidence,
+    GroupEvidenceSource,
     LaneReplay,
     evenly_spaced_indices,
-    largest_and_evenly_spaced,
+    indices_of_largest_and_evenly_spaced,
 )
 from .noise import NoisePaths
 from .preparation import invariants_and_laws
@@ -39,7 +39,7 @@ from .problem import Problem
 from .schedule import StepSchedule
 from .solution_builder import RecordedFunctions, build_solution, velocities_at_states
 from .system_family import Family
-from .termination import ensemble_failure_message
+from .termination import ensemble_blow_up_message_or_empty
 
 RECORDED_QUANTITIES = (
     "energy entropy energy_drift largest_energy_increment least_entropy_increment entropy_scale relaxation_time "
@@ -59,16 +59,16 @@ MemberSelection = slice | np.ndarray
 
 
 class TrajectoryGroup(NamedTuple):
-    """Trajectories of an ensemble that one program runs, as they are run.
+    """Trajectories of an ensemble that one program runs, with their systems, initial states, schedule and noise.
 
     Attributes
     ----------
-    numbers : array of int, shape (B,)
+    trajectory_numbers : array of int, shape (B,)
         Numbers of the trajectories in the ensemble, increasing.
     problem : Problem
-        The problem of one of them, whose method and laws belong to all.
+        The problem of one trajectory, whose method and laws belong to all.
     family : Family
-        Their systems.
+        The systems of the trajectories.
     member : System
         One member of the family.
     x0 : array, shape (B, n)
@@ -79,11 +79,11 @@ class TrajectoryGroup(NamedTuple):
     control : StepControl or None
         The control of adaptive steps, and of steps of a given size with events.
     events : EventSet or None
-        The events whose functions the control has.
+        The events, whose functions the control monitors.
     noise : NoisePaths or None
     """
 
-    numbers: np.ndarray
+    trajectory_numbers: np.ndarray
     problem: Problem
     family: Family
     member: System
@@ -103,7 +103,8 @@ class TrajectoryGroup(NamedTuple):
 class EnsembleRecord:
     """Outcomes and saved states of all trajectories of an ensemble, filled in group by group.
 
-    Arrays have the trajectories first. Those of trajectories in no group are NaN, and their status is inadmissible.
+    The first axis of arrays is that of the trajectories. The entries of trajectories that belong to no group are NaN,
+    and their status is inadmissible.
 
     Parameters
     ----------
@@ -136,20 +137,24 @@ class EnsembleRecord:
         if len(self.x0) < n_trajectories:
             self.x0 = np.full((n_trajectories, dim), np.nan)
             for group in groups:
-                self.x0[group.numbers] = group.x0
+                self.x0[group.trajectory_numbers] = group.x0
         self.failure_reasons: dict[int, str] = {}
         self.events: list[EventOccurrence] = []
         self.groups = [GroupRecord(self, group) for group in groups]
 
-    def to_ensemble(self, reasons: Mapping[int, str], provenance: Mapping[str, Any], **fields: Any) -> Ensemble:
-        """Return the recorded trajectories as an :class:`Ensemble`, with further fields of it.
+    def to_ensemble(
+        self, inadmissible_reasons: Mapping[int, str], provenance: Mapping[str, Any], **other_fields: Any
+    ) -> Ensemble:
+        """Return the recorded trajectories as an :class:`Ensemble`.
 
         Parameters
         ----------
-        reasons : mapping from int to str
-            Why trajectories are inadmissible.
+        inadmissible_reasons : mapping from int to str
+            Why trajectories are inadmissible, by their numbers.
         provenance : mapping
-            Without the engine.
+            The provenance without the engine.
+        **other_fields
+            Fields of the ensemble that are not recorded.
         """
         quantities: dict[str, Any] = {
             n: values for n, values in self.quantities.items() if n not in ("distance", "first_step")
@@ -164,16 +169,19 @@ class EnsembleRecord:
             )
         x0, attitude, attitude0, work = self.x0, None, None, self.work
         if (layout := self.member.attitude_layout) is not None:
-            x0, attitude0 = map(np.asarray, layout.split(x0))
+            x0, attitude0 = map(np.asarray, layout.split_state(x0))
             if x is not None:
-                x, attitude = map(np.asarray, layout.split(x))
+                x, attitude = map(np.asarray, layout.split_state(x))
         if self.clock is not None:
             if self.trajectories is not None:
                 work = np.asarray(self.clock.work(x))
             x, x0, energy = None if x is None else x[..., :-2], x0[..., :-2], energy + work
-        events, sources = self.groups[0].group.events, [part.evidence_source() for part in self.groups]
-        engine = " and ".join(sorted({part.engine for part in self.groups} - {""}))
-        result = Ensemble(
+        events, sources = (
+            self.groups[0].group.events,
+            [group_record.make_evidence_source() for group_record in self.groups],
+        )
+        engine = " and ".join(sorted({group_record.engine for group_record in self.groups} - {""}))
+        ensemble = Ensemble(
             t=t,
             x=x,
             energy=energy,
@@ -186,35 +194,45 @@ class EnsembleRecord:
             attitude=attitude,
             attitude0=attitude0,
             work=work,
-            laws=common_laws([part.group.problem.laws for part in self.groups]),
+            laws=common_laws([group_record.group.problem.laws for group_record in self.groups]),
             engine=engine,
             events=Events() if events is None else collect_events(self.member, events.names, self.events),
-            reasons={**reasons, **self.failure_reasons},
+            reasons={**inadmissible_reasons, **self.failure_reasons},
             provenance={**provenance, "engine": engine},
             evidence_source=functools.cache(lambda: merge_evidence([source() for source in sources])),
             velocity_sources=self._velocity_getters_by_name(),
             solution_builder=self._build_solution,
             **quantities,
-            **fields,
+            **other_fields,
         )
-        return reshape_to_sites(self.member, result)
+        return reshape_to_sites(self.member, ensemble)
 
     def _velocity_getters_by_name(self) -> dict[str, Callable[[], np.ndarray]]:
         """Return functions that compute the velocities of all trajectories, by the names of the velocities."""
         if self.x is None and self.trajectories is None:
             return {}
-        return {name: functools.partial(self._velocities, name) for name in self.member.motion_quantities.velocities}
+        return {
+            name: functools.partial(self._compute_velocities, name) for name in self.member.motion_quantities.velocities
+        }
 
-    def _velocities(self, name: str) -> np.ndarray:
-        velocities, numbers = zip(*((part.velocities(name), part.numbers) for part in self.groups), strict=True)
+    def _compute_velocities(self, velocity_name: str) -> np.ndarray:
+        velocities, trajectory_numbers = zip(
+            *(
+                (group_record.compute_velocities(velocity_name), group_record.trajectory_numbers)
+                for group_record in self.groups
+            ),
+            strict=True,
+        )
         values = np.full((len(self.status), *velocities[0].shape[1:]), np.nan)
-        values[np.concatenate(numbers)] = np.concatenate(velocities)
+        values[np.concatenate(trajectory_numbers)] = np.concatenate(velocities)
         return values
 
     def _build_solution(self, ensemble: Ensemble, i: int) -> Solution:
-        """Return the solution of a trajectory, as a single run would present it."""
-        part = next(part for part in self.groups if i in part.numbers)
-        return part.build_solution(ensemble.member_solution(i), int(np.searchsorted(part.numbers, i)))
+        """Return the solution of trajectory i of the ensemble with the fields that a single run would have."""
+        group_record = next(group_record for group_record in self.groups if i in group_record.trajectory_numbers)
+        return group_record.complete_member_solution(
+            ensemble.member_solution(i), int(np.searchsorted(group_record.trajectory_numbers, i))
+        )
 
 
 class GroupRecord:
@@ -234,122 +252,133 @@ class GroupRecord:
     """
 
     def __init__(self, record: EnsembleRecord, group: TrajectoryGroup):
-        self.record, self.group, self.numbers, self.engine = record, group, group.numbers, ""
-        self._is_all = len(self.numbers) == len(record.status)
-        rows = self._rows(slice(None))
+        self.record, self.group, self.trajectory_numbers, self.engine = record, group, group.trajectory_numbers, ""
+        self._is_all = len(self.trajectory_numbers) == len(record.status)
+        rows = self._row_indices_of_members(slice(None))
         record.status[rows] = StatusCode.INTERRUPTED
-        record.quantities["first_step"][rows] = group.schedule.longest_steps[0]
+        record.quantities["first_step"][rows] = group.schedule.longest_step_after_each_save[0]
         record.quantities["end_time"][rows] = group.schedule.start
 
-    def _rows(self, members: MemberSelection) -> MemberSelection:
+    def _row_indices_of_members(self, members: MemberSelection) -> MemberSelection:
         """Return the rows of the record for the trajectories with these indices in the group."""
-        return members if self._is_all else self.numbers[members]
+        return members if self._is_all else self.trajectory_numbers[members]
 
     @property
     def is_interrupted(self) -> bool:
         """True if the run of the group was interrupted: a trajectory has not reached its end, and has not failed."""
-        return bool((self.record.status[self._rows(slice(None))] == StatusCode.INTERRUPTED).any())
+        return bool((self.record.status[self._row_indices_of_members(slice(None))] == StatusCode.INTERRUPTED).any())
 
-    def quantity(self, name: str, members: np.ndarray) -> np.ndarray:
-        """Return the recorded values of a quantity for trajectories of the group."""
-        return self.record.quantities[name][self._rows(members)]
+    def read_quantity(self, quantity_name: str, members: np.ndarray) -> np.ndarray:
+        """Return the recorded values of a quantity, one for each of these trajectories."""
+        return self.record.quantities[quantity_name][self._row_indices_of_members(members)]
 
-    def store_first_steps(self, members: np.ndarray, sizes: np.ndarray) -> None:
-        """Store the sizes of the first steps of trajectories."""
-        self.record.quantities["first_step"][self._rows(members)] = sizes
+    def store_first_step_sizes(self, members: np.ndarray, step_sizes: np.ndarray) -> None:
+        """Store the size of the first step of each of these trajectories."""
+        self.record.quantities["first_step"][self._row_indices_of_members(members)] = step_sizes
 
-    def record_initial(self, members: MemberSelection, x: np.ndarray, energy: np.ndarray, entropy: np.ndarray) -> None:
+    def store_initial_states(
+        self, members: MemberSelection, x: np.ndarray, energy: np.ndarray, entropy: np.ndarray
+    ) -> None:
         """Store the initial states with energy and entropy, if trajectories are saved."""
         if self.record.trajectories is not None:
-            self.record.trajectories[self._rows(members), 0] = np.column_stack([x, energy, entropy])
+            self.record.trajectories[self._row_indices_of_members(members), 0] = np.column_stack([x, energy, entropy])
 
-    def store_states(self, members: MemberSelection, first_save: int, states: np.ndarray) -> None:
-        """Store states from save number ``first_save`` on, with energy and entropy, shape (members, saves, n + 2)."""
+    def store_consecutive_saves(self, members: MemberSelection, first_save: int, states: np.ndarray) -> None:
+        """Store saved states with energy and entropy, shape (members, saves, n + 2), from save ``first_save`` on."""
         if self.record.trajectories is not None:
             saves = slice(first_save, first_save + states.shape[1])
-            self.record.trajectories[self._rows(members), saves] = states
+            self.record.trajectories[self._row_indices_of_members(members), saves] = states
 
-    def store_states_at(self, members: np.ndarray, t: np.ndarray, states: np.ndarray) -> None:
-        """Store states with energy and entropy, shape (members, n + 2), each at its saved time t."""
+    def store_states_at_times(self, members: np.ndarray, times: np.ndarray, states: np.ndarray) -> None:
+        """Store one state of each trajectory with energy and entropy, shape (members, n + 2), at its time to save."""
         if self.record.trajectories is not None:
-            self.record.trajectories[self._rows(members), np.searchsorted(self.record.saved_times, t)] = states
+            self.record.trajectories[
+                self._row_indices_of_members(members), np.searchsorted(self.record.saved_times, times)
+            ] = states
 
     def store_events(self, occurrences: Sequence[EventOccurrence], members: np.ndarray) -> None:
-        """Store events of trajectories whose indices in the group are ``members[trajectory]``."""
+        """Store events of a batch, whose trajectories have the indices ``members`` in the group."""
         for event in occurrences:
             member = int(members[event.trajectory])
             if event.trajectory == 0 or members[event.trajectory - 1] != member:  # no copy that fills a padded batch
-                self.record.events.append(event._replace(trajectory=int(self.numbers[member])))
+                self.record.events.append(event._replace(trajectory=int(self.trajectory_numbers[member])))
 
-    def finish_fixed_step_members(
-        self, members: MemberSelection, initial: Mapping[str, np.ndarray], final: Mapping[str, np.ndarray]
+    def record_outcome_of_fixed_steps(
+        self, members: MemberSelection, initial_fields: Mapping[str, np.ndarray], final_fields: Mapping[str, np.ndarray]
     ) -> None:
-        """Record the outcome of trajectories with fixed steps, from their first and last engine states.
+        """Record status, end time, final state and audit quantities of trajectories with fixed steps.
 
         Parameters
         ----------
-        initial, final : mapping of arrays
+        initial_fields, final_fields : mapping of arrays
             Fields of :class:`liethermo.engines.step.State`.
         """
-        steps, schedule = final["step"].astype(np.int64), self.group.schedule
-        is_unfinished = (final["status"] == StatusCode.COMPLETED) & (steps < schedule.n_steps)
-        status = np.where(is_unfinished, StatusCode.INTERRUPTED, final["status"])
-        self.finish_members(members, initial, final, status, schedule.times_after(steps))
+        n_steps_taken, schedule = final_fields["step"].astype(np.int64), self.group.schedule
+        is_unfinished = (final_fields["status"] == StatusCode.COMPLETED) & (n_steps_taken < schedule.n_steps)
+        status = np.where(is_unfinished, StatusCode.INTERRUPTED, final_fields["status"])
+        self.record_outcome(members, initial_fields, final_fields, status, schedule.times_after(n_steps_taken))
         if self.record.trajectories is not None:
-            counts, rows = schedule.saved_step_counts, self._rows(members)
-            is_after_end = np.arange(len(counts)) >= np.searchsorted(counts, steps, side="right")[:, None]
+            counts, rows = schedule.saved_step_counts, self._row_indices_of_members(members)
+            is_after_end = np.arange(len(counts)) >= np.searchsorted(counts, n_steps_taken, side="right")[:, None]
             trajectories = self.record.trajectories
             trajectories[rows] = np.where(is_after_end[..., None], np.nan, trajectories[rows])
 
     @np.errstate(over="ignore", invalid="ignore")  # overflowed states have the status non_finite
-    def finish_members(
+    def record_outcome(
         self,
         members: MemberSelection,
-        initial: Mapping,
-        final: Mapping,
-        status: np.ndarray,
-        end_time: np.ndarray,
+        initial_fields: Mapping,
+        final_fields: Mapping,
+        status_codes: np.ndarray,
+        end_times: np.ndarray,
         n_rejected: np.ndarray | None = None,
     ) -> None:
-        """Record the outcome of trajectories: status, end time, final state and the quantities of the audit."""
-        record, group, rows = self.record, self.group, self._rows(members)
-        quantities, energy, initial_energy = record.quantities, final["energy"], initial["energy"]
-        quantities["energy"][rows], quantities["entropy"][rows] = energy, final["entropy"]
-        drift = np.maximum(final["largest_energy"] - initial_energy, initial_energy - final["smallest_energy"])
-        quantities["energy_drift"][rows] = drift / RoundingScale(initial_energy, final["energy_sensitivity"]).scale
+        """Record status, end time, final state and audit quantities of trajectories, from first and last engine
+        fields."""
+        record, group, rows = self.record, self.group, self._row_indices_of_members(members)
+        quantities, energy, initial_energy = record.quantities, final_fields["energy"], initial_fields["energy"]
+        quantities["energy"][rows], quantities["entropy"][rows] = energy, final_fields["entropy"]
+        drift = np.maximum(
+            final_fields["largest_energy"] - initial_energy, initial_energy - final_fields["smallest_energy"]
+        )
+        quantities["energy_drift"][rows] = (
+            drift / RoundingScale(initial_energy, final_fields["energy_sensitivity"]).scale
+        )
         for name in ("energy_sensitivity", "entropy_sensitivity", "first_energy", "smallest_energy", "largest_energy"):
-            quantities[name][rows] = final[name]
-        quantities["entropy_change"][rows] = final["entropy"] - initial["entropy"]
-        quantities["distance"][rows] = np.abs(final["x"] - initial["x"]).max(axis=1)
-        quantities["largest_energy_increment"][rows] = final["largest_energy_increment"]
-        quantities["least_entropy_increment"][rows] = final["least_entropy_increment"]
-        quantities["entropy_scale"][rows] = np.maximum(np.abs(initial["entropy"]), np.abs(final["entropy"]))
-        quantities["residual"][rows] = final["residual"]
-        quantities["end_time"][rows] = end_time
+            quantities[name][rows] = final_fields[name]
+        quantities["entropy_change"][rows] = final_fields["entropy"] - initial_fields["entropy"]
+        quantities["distance"][rows] = np.abs(final_fields["x"] - initial_fields["x"]).max(axis=1)
+        quantities["largest_energy_increment"][rows] = final_fields["largest_energy_increment"]
+        quantities["least_entropy_increment"][rows] = final_fields["least_entropy_increment"]
+        quantities["entropy_scale"][rows] = np.maximum(
+            np.abs(initial_fields["entropy"]), np.abs(final_fields["entropy"])
+        )
+        quantities["residual"][rows] = final_fields["residual"]
+        quantities["end_time"][rows] = end_times
         start, end = (
             np.asarray(energy_or_entropy_that_relaxes(group.member, f["energy"], f["entropy"]))
-            for f in (initial, final)
+            for f in (initial_fields, final_fields)
         )
         change = np.where(np.abs(end - start) > 1e-12 * np.abs(end), end - start, np.nan)
         quantities["relaxation_time"][rows] = (
-            end * (end_time - group.schedule.start) - final["relaxation_integral"]
+            end * (end_times - group.schedule.start) - final_fields["relaxation_integral"]
         ) / change
-        record.status[rows], record.steps[rows] = status, final["step"]
-        record.iterations[rows] = final["fixed_point_iterations"] + final["newton_iterations"]
+        record.status[rows], record.steps[rows] = status_codes, final_fields["step"]
+        record.iterations[rows] = final_fields["fixed_point_iterations"] + final_fields["newton_iterations"]
         if n_rejected is not None:
             record.rejected[rows] = n_rejected
-        self._store_failure_reasons(members, final["x"], status, end_time)
+        self._store_reasons_of_unbounded_growth(members, final_fields["x"], status_codes, end_times)
         if record.x is not None:
-            record.x[rows] = final["x"]
+            record.x[rows] = final_fields["x"]
         if record.clock is not None and record.work is not None:
-            record.work[rows] = record.clock.work(final["x"])
+            record.work[rows] = record.clock.work(final_fields["x"])
 
-    def _store_failure_reasons(
-        self, members: MemberSelection, x: np.ndarray, status: np.ndarray, end_time: np.ndarray
+    def _store_reasons_of_unbounded_growth(
+        self, members: MemberSelection, final_states: np.ndarray, status_codes: np.ndarray, end_times: np.ndarray
     ) -> None:
         """Store a message for each trajectory that grows without bound, among the first ones that fail."""
-        status, end_time = (np.broadcast_to(a, len(x)) for a in (status, end_time))
-        failed_rows = np.flatnonzero(np.isin(status, FAILURE_CODES))[
+        status_codes, end_times = (np.broadcast_to(a, len(final_states)) for a in (status_codes, end_times))
+        failed_rows = np.flatnonzero(np.isin(status_codes, FAILURE_CODES))[
             : max(0, MAX_EXPLAINED_FAILURES - len(self.record.failure_reasons))
         ]
         if not len(failed_rows):
@@ -357,38 +386,44 @@ class GroupRecord:
         group = self.group
         member_indices = np.arange(len(group.x0))[members][failed_rows]
         with np.errstate(all="ignore"):
-            velocities = np.asarray(group.family.evaluate(vector_field, member_indices, x[failed_rows]))
+            velocities = np.asarray(group.family.evaluate(vector_field, member_indices, final_states[failed_rows]))
         for i, j, velocity in zip(failed_rows, member_indices, velocities, strict=True):
-            t = float(end_time[i])
-            if text := ensemble_failure_message(x[i], group.x0[j], velocity, t - group.schedule.start, t, group.h):
-                self.record.failure_reasons[int(self.numbers[j])] = text
+            t = float(end_times[i])
+            if text := ensemble_blow_up_message_or_empty(
+                final_states[i], group.x0[j], velocity, t - group.schedule.start, t, group.h
+            ):
+                self.record.failure_reasons[int(self.trajectory_numbers[j])] = text
 
-    def evidence_source(self) -> GroupEvidence:
-        """Return the function that computes the evidence for an audit, of a sample of the trajectories.
+    def make_evidence_source(self) -> GroupEvidenceSource:
+        """Return the function that computes the evidence for an audit from a sample of the trajectories.
 
-        Half of them are those that took most iterations, half are evenly spaced.
+        Half of the sample took most iterations, half is evenly spaced.
         """
         record, group = self.record, self.group
-        n_steps = record.steps[self.numbers]
-        sample = largest_and_evenly_spaced(record.iterations[self.numbers] / np.fmax(n_steps, 1), MAX_LOCAL_ERROR_STEPS)
+        n_steps = record.steps[self.trajectory_numbers]
+        sample_indices = indices_of_largest_and_evenly_spaced(
+            record.iterations[self.trajectory_numbers] / np.fmax(n_steps, 1), MAX_LOCAL_ERROR_STEPS
+        )
         n_equal_steps = 1 if np.isnan(group.h) else group.schedule.segments[0].n_full_steps
-        return GroupEvidence(
+        return GroupEvidenceSource(
             group.member,
-            LaneReplay(self.engine, group.family.select(sample), group.method),
-            np.ascontiguousarray(group.x0[sample]),
+            LaneReplay(self.engine, group.family.select(sample_indices), group.method),
+            np.ascontiguousarray(group.x0[sample_indices]),
             group.schedule.start,
-            self.quantity("first_step", sample),
-            np.fmin(n_steps[sample], max(1, n_equal_steps)),
-            self.quantity("distance", sample),
-            *self.sampled_states(sample),
+            self.read_quantity("first_step", sample_indices),
+            np.fmin(n_steps[sample_indices], max(1, n_equal_steps)),
+            self.read_quantity("distance", sample_indices),
+            *self.saved_states_and_times_of_sample(sample_indices),
         )
 
-    def sampled_states(self, sample: np.ndarray) -> tuple[Sequence[np.ndarray] | np.ndarray, np.ndarray]:
-        """Return saved states of these trajectories, shape (sample, times, n), at times spread over the run.
+    def saved_states_and_times_of_sample(
+        self, sample_indices: np.ndarray
+    ) -> tuple[Sequence[np.ndarray] | np.ndarray, np.ndarray]:
+        """Return saved states of some trajectories, shape (sample, times, n), and their times, spread over the run.
 
-        Both are empty if the run keeps no states.
+        Both are empty if the run saves no states.
         """
-        record, rows = self.record, self.numbers[sample]
+        record, rows = self.record, self.trajectory_numbers[sample_indices]
         if record.trajectories is not None:
             times = evenly_spaced_indices(record.trajectories.shape[1], MAX_SENSITIVITY_STATES)
             return record.trajectories[rows][:, times, :-2], record.saved_times[times]
@@ -398,9 +433,9 @@ class GroupRecord:
         end = np.nanmax(record.quantities["end_time"])
         return states, np.linspace(record.start, end, MAX_SENSITIVITY_STATES)
 
-    def velocities(self, name: str) -> np.ndarray:
-        """Return the velocities of a name at the recorded states of the group, trajectories first."""
-        rows, x, trajectories = self._rows(slice(None)), self.record.x, self.record.trajectories
+    def compute_velocities(self, velocity_name: str) -> np.ndarray:
+        """Return velocities, shape (members, ..., k), at the recorded states of the group."""
+        rows, x, trajectories = self._row_indices_of_members(slice(None)), self.record.x, self.record.trajectories
         if trajectories is None:
             assert x is not None
             states = x[rows]
@@ -408,18 +443,23 @@ class GroupRecord:
             states = trajectories[rows, ..., :-2]
         family = self.group.family
         if not any(family.has_member_axis):
-            return velocities_at_states(name, self.group.member, states)
-        return np.stack([velocities_at_states(name, family.member(i), x) for i, x in enumerate(states)])
+            return velocities_at_states(velocity_name, self.group.member, states)
+        return np.stack([velocities_at_states(velocity_name, family.member(i), x) for i, x in enumerate(states)])
 
-    def build_solution(self, member_solution: Solution, j: int) -> Solution:
-        """Return the solution of trajectory j of the group, as a single run would present it.
+    def complete_member_solution(self, member_solution: Solution, member_index: int) -> Solution:
+        """Return the solution of a member with the conserved functions and laws that a single run would have.
 
-        ``member_solution`` is the one that the ensemble has, without conserved functions.
+        ``member_solution`` holds what the ensemble knows of it: states, energy, entropy, status and statistics.
         """
-        method, system, row, record = self.group.method, self.group.family.member(j), int(self.numbers[j]), self.record
+        method, system, row, record = (
+            self.group.method,
+            self.group.family.member(member_index),
+            int(self.trajectory_numbers[member_index]),
+            self.record,
+        )
         if record.trajectories is None:
             assert record.x is not None
-            x = np.stack([self.group.x0[j], record.x[row]])
+            x = np.stack([self.group.x0[member_index], record.x[row]])
         else:
             x = record.trajectories[row, : len(member_solution.t), :-2]
         steps = np.minimum(np.diff(member_solution.t), record.quantities["first_step"][row])
@@ -446,14 +486,14 @@ class GroupRecord:
 
 
 def common_laws(laws_of_groups: Sequence[Laws]) -> Laws:
-    """Return the laws that hold for all groups: a function is conserved or not promised only if each group has it."""
-    first = laws_of_groups[0]
-    promised = set.intersection(*(set(laws.conserved) for laws in laws_of_groups))
-    constants = set.intersection(*({*laws.conserved, *laws.unpromised} for laws in laws_of_groups))
-    names = [name for name in (*first.conserved, *first.unpromised) if name in constants]
+    """Return the laws that hold for all groups: the functions that every group conserves, or does not promise."""
+    first_laws = laws_of_groups[0]
+    commonly_conserved_names = set.intersection(*(set(laws.conserved) for laws in laws_of_groups))
+    common_constant_names = set.intersection(*({*laws.conserved, *laws.unpromised} for laws in laws_of_groups))
+    names = [name for name in (*first_laws.conserved, *first_laws.unpromised) if name in common_constant_names]
     return replace(
-        first,
-        conserved=tuple(name for name in names if name in promised),
-        unpromised=tuple(name for name in names if name not in promised),
+        first_laws,
+        conserved=tuple(name for name in names if name in commonly_conserved_names),
+        unpromised=tuple(name for name in names if name not in commonly_conserved_names),
         unknown=tuple(dict.fromkeys(name for laws in laws_of_groups for name in laws.unknown)),
     )

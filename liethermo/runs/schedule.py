@@ -26,8 +26,17 @@ multiples of a step."""
 
 
 class ScheduleSegment(NamedTuple):
-    """Equal steps from ``start`` to ``end``, and a last one of size ``last_step_size`` if the equal steps do not reach
-    the end. ``saves_end`` says whether the state at the end is saved."""
+    """Equal steps from ``start`` to ``end``, with a shorter last step if the equal steps do not reach the end.
+
+    Attributes
+    ----------
+    start, end : float
+    n_full_steps : int
+    last_step_size : float
+        Size of the shorter last step; 0 if there is none.
+    saves_end : bool
+        Whether the state at the end is saved.
+    """
 
     start: float
     end: float
@@ -37,6 +46,7 @@ class ScheduleSegment(NamedTuple):
 
     @classmethod
     def from_span(cls, start: float, end: float, h: float, saves_end: bool = True) -> ScheduleSegment:
+        """Return the segment of steps of size h over a span, to rounding of the times."""
         if math.isinf(h):
             return cls(start, end, 0, end - start, saves_end)
         # The tolerance keeps 0.1 * 1000 from asking for a thousand-and-first step of 1e-14, and 1024.9 - 1024.8 from
@@ -51,8 +61,8 @@ class ScheduleSegment(NamedTuple):
     def n_steps(self) -> int:
         return self.n_full_steps + (self.last_step_size > 0.0)
 
-    def equal_steps(self, h: float) -> list[tuple[float, int]]:
-        """Return the step sizes, and how many steps of each size follow one another."""
+    def step_sizes_and_counts(self, h: float) -> list[tuple[float, int]]:
+        """Return a list of (step size, number of steps): the equal steps, then the shorter last one."""
         return [(size, n) for size, n in ((h, self.n_full_steps), (self.last_step_size, 1)) if n and size]
 
 
@@ -61,14 +71,14 @@ class EngineCall(NamedTuple):
 
     Attributes
     ----------
-    keep : bool
+    are_states_saved : bool
         False if the states of this call are not among the saved states of the run.
     """
 
     h: float
     n_saves: int
     steps_per_save: int
-    keep: bool
+    are_states_saved: bool
 
 
 class StepSchedule:
@@ -92,7 +102,7 @@ class StepSchedule:
     ----------
     start, end, h : float
     breaks, all_breaks : tuple of float
-        The breaks inside the span, and all.
+        The breaks inside the span, and all breaks that were given.
     segments : list of ScheduleSegment
         One for each stop: each time to save, and each break.
     n_steps : int
@@ -121,7 +131,7 @@ class StepSchedule:
             raise InputError(f"save_every must be a positive integer, got {save_every!r}")
         saved_stops = {self.end} if save_at is None else {float(t) for t in save_at if t > self.start}
         self.all_breaks = tuple(breaks)
-        rounding = self._break_rounding
+        rounding = self._break_tolerance
         self.breaks = tuple(t for t in breaks if self.start + rounding < t < self.end - rounding)
         stops = sorted({*saved_stops, *self.breaks})
         self.save_every = save_every
@@ -141,30 +151,31 @@ class StepSchedule:
         return schedule
 
     @property
-    def _break_rounding(self) -> float:
-        """Distance up to which a break counts as being at an end of the span."""
+    def _break_tolerance(self) -> float:
+        """Largest distance at which a break counts as being at an end of the span."""
         return BREAK_RTOL * max(abs(self.start), abs(self.end) if math.isfinite(self.end) else 0.0)
 
     @property
-    def function_span(self) -> tuple[float, float]:
+    def span_of_time_functions(self) -> tuple[float, float]:
         """First and last time at which functions of time are evaluated.
 
-        It is the span, but by a rounding error from after a break at its start, and from before a break at its end.
+        The span, shortened by a rounding error if there is a break at its start or end, so that functions are evaluated
+        after the first break and before the last.
         """
-        rounding = self._break_rounding
+        rounding = self._break_tolerance
         starts_at_break = any(abs(t - self.start) <= rounding for t in self.all_breaks)
         ends_at_break = any(abs(t - self.end) <= rounding for t in self.all_breaks)
         return self.start + rounding * starts_at_break, self.end - rounding * ends_at_break
 
     def with_more_breaks(self, breaks: Sequence[float]) -> StepSchedule:
-        """Return the schedule with more breaks, inside the span."""
+        """Return a schedule that also ends steps at these breaks inside the span."""
         if not breaks:
             return self
         save_at = self.saved_stop_times if self.save_every is None else None
-        all_breaks = sorted({*self.all_breaks, *breaks})
-        return StepSchedule((self.start, self.end), self.h, self.save_every, save_at, breaks=all_breaks)
+        break_times = sorted({*self.all_breaks, *breaks})
+        return StepSchedule((self.start, self.end), self.h, self.save_every, save_at, breaks=break_times)
 
-    def ends_step_at(self, t: float) -> bool:
+    def has_step_end_at(self, t: float) -> bool:
         """Return whether a time inside the span is a whole number of steps after its start, to rounding."""
         segment = next(segment for segment in self.segments if t <= segment.end)
         n_steps = round((t - segment.start) / self.h)
@@ -192,8 +203,8 @@ class StepSchedule:
                 )
                 n_done += n_saves * steps_per_save
                 is_end = n_done >= segment.n_steps
-                keep = save_every is not None or (is_end and segment.saves_end)
-                yield EngineCall(self.h, n_saves, steps_per_save, keep)
+                are_states_saved = save_every is not None or (is_end and segment.saves_end)
+                yield EngineCall(self.h, n_saves, steps_per_save, are_states_saved)
             if segment.last_step_size:
                 yield EngineCall(segment.last_step_size, 1, 1, segment.saves_end)
 
@@ -208,8 +219,7 @@ class StepSchedule:
         return np.array([segment.end for segment in self.segments if segment.saves_end])
 
     def step_size_after(self, n_steps: int) -> float:
-        """Return the size of the step that follows the first ``n_steps`` steps; at the end, the size of the last
-        step."""
+        """Return the size of the step that follows ``n_steps`` steps; at the end, the size of the last step."""
         for segment in self.segments:
             if n_steps < segment.n_steps or segment is self.segments[-1]:
                 break
@@ -217,13 +227,13 @@ class StepSchedule:
         return segment.last_step_size if n_steps >= segment.n_full_steps else self.h
 
     @property
-    def longest_steps(self) -> np.ndarray:
-        """The longest step after each saved state, shape (saved states - 1,)."""
+    def longest_step_after_each_save(self) -> np.ndarray:
+        """Size of the longest step between each saved state and the next, shape (saved states - 1,)."""
         if not self.segments:
             return np.zeros(0)
         n_full_steps, last_step_sizes = self._full_steps_and_last_step_sizes
         full_steps_before_segments = np.cumsum([0, *n_full_steps])
-        segment_index = self._segment_of_step(self.saved_step_counts)
+        segment_index = self._segment_indices_after_steps(self.saved_step_counts)
         steps_in_segment = self.saved_step_counts - self._steps_before_segments[segment_index]
         n_full = full_steps_before_segments[segment_index] + np.minimum(steps_in_segment, n_full_steps[segment_index])
         longest_last_steps = np.maximum.reduceat(last_step_sizes, segment_index[:-1])
@@ -249,9 +259,9 @@ class StepSchedule:
             np.array([segment.last_step_size for segment in self.segments]),
         )
 
-    def _segment_of_step(self, steps: np.ndarray) -> np.ndarray:
-        """Return the indices of the segments to which the steps after the given numbers of steps belong."""
-        index = np.searchsorted(self._steps_before_segments, steps, side="right") - 1
+    def _segment_indices_after_steps(self, step_counts: np.ndarray) -> np.ndarray:
+        """Return the indices of the segments that contain the steps which follow ``step_counts`` steps."""
+        index = np.searchsorted(self._steps_before_segments, step_counts, side="right") - 1
         return np.clip(index, 0, len(self.segments) - 1)
 
     @functools.cached_property
@@ -268,20 +278,22 @@ class StepSchedule:
         """Return the time after ``n_steps`` steps."""
         return self.end if n_steps >= self.n_steps else float(self.times_after(np.asarray(n_steps)))
 
-    def times_after(self, steps: np.ndarray) -> np.ndarray:
-        """Return the times after the given numbers of steps."""
+    def times_after(self, step_counts: np.ndarray) -> np.ndarray:
+        """Return the times after ``step_counts`` steps, in an array of the same shape."""
         if len(self.segments) == 1:
-            times = np.minimum(_time_after(self.start, steps, self.h), self.end)
-            return np.where(steps >= self.n_steps, self.end, times)
-        segment_index = self._segment_of_step(steps)
+            times = np.minimum(_add_steps_to_time(self.start, step_counts, self.h), self.end)
+            return np.where(step_counts >= self.n_steps, self.end, times)
+        segment_index = self._segment_indices_after_steps(step_counts)
         starts, ends = (
             np.array([getattr(segment, name) for segment in self.segments])[segment_index] for name in ("start", "end")
         )
-        is_last_step = steps >= self._steps_before_segments[segment_index + 1]
+        is_last_step = step_counts >= self._steps_before_segments[segment_index + 1]
         return np.where(
             is_last_step,
             ends,
-            np.minimum(_time_after(starts, steps - self._steps_before_segments[segment_index], self.h), ends),
+            np.minimum(
+                _add_steps_to_time(starts, step_counts - self._steps_before_segments[segment_index], self.h), ends
+            ),
         )
 
 
@@ -299,35 +311,34 @@ def make_schedule(
     save_at=None,
     allow_infinite_end: bool = False,
     breaks: Sequence[float] = (),
-    declared: DeclaredTimes = TIMES_OF_SMOOTH_FUNCTIONS,
+    declared_times: DeclaredTimes = TIMES_OF_SMOOTH_FUNCTIONS,
 ) -> StepSchedule:
     """Return the schedule of a run; an adaptive run has one nominal step, as long as the span.
 
-    With ``save_at`` the steps end at these times, and only the states there are saved. Steps end at the user's
-    ``breaks``, at the jumps that the system declares and at its kinks, as far as they lie inside the span. Kinks are
-    left out where there are more than MAX_KINKS of them, more than steps of a given size, or where they would change
-    which states ``save_every`` saves.
+    With ``save_at`` the steps end at these times, and only the states there are saved. Steps also end at the user's
+    ``breaks`` and at the declared jumps and kinks of the system inside the span. Kinks are left out if they are more
+    than MAX_KINKS or more than the fixed steps, or if they would change which states ``save_every`` saves.
     """
     start, end = checked_span(span, allow_infinite_end)
-    refuse_unknown_times(start, end, declared.known_span)
+    refuse_span_beyond_known_times(start, end, declared_times.known_span)
     step_size = end - start if isinstance(step, Adaptive) else checked_step(step, start, end)
-    kinks = [t for t in declared.kinks if start < t < end]
+    kinks = [t for t in declared_times.kinks if start < t < end]
     if not isinstance(step, Adaptive) and (save_every not in (None, 1) or len(kinks) * step_size > end - start):
         kinks = []
     kinks = kinks if len(kinks) <= MAX_KINKS else []
-    all_breaks = {*(checked_breaks(breaks) if np.size(breaks) else ()), *declared.jumps, *kinks}
-    breaks_in_span = tuple(sorted(t for t in all_breaks if start <= t <= end))
+    break_times = {*(checked_breaks(breaks) if np.size(breaks) else ()), *declared_times.jumps, *kinks}
+    breaks_in_span = tuple(sorted(t for t in break_times if start <= t <= end))
     schedule = StepSchedule(
         (start, end), step_size, save_every, allow_infinite_end=allow_infinite_end, breaks=breaks_in_span
     )
     if save_at is None:
         return schedule
-    save_times = _save_times(save_at, start, end, schedule.breaks)
+    save_times = _sorted_save_times_and_end(save_at, start, end, schedule.breaks)
     return StepSchedule((start, end), step_size, None, save_times, allow_infinite_end, breaks_in_span)
 
 
-def refuse_unknown_times(start: float, end: float, known_span: tuple[float, float]) -> None:
-    """Raise InputError if a span goes beyond the times at which functions of time are known, by more than rounding."""
+def refuse_span_beyond_known_times(start: float, end: float, known_span: tuple[float, float]) -> None:
+    """Raise InputError if a span exceeds the times at which functions of time are known by more than rounding."""
     rounding = TIME_TOLERANCE_ULPS * EPS * max(abs(t) for t in (start, end, *known_span) if math.isfinite(t))
     if start < known_span[0] - rounding or end > known_span[1] + rounding:
         raise InputError(
@@ -336,8 +347,14 @@ def refuse_unknown_times(start: float, end: float, known_span: tuple[float, floa
         )
 
 
-def _save_times(save_at, start: float, end: float, breaks: tuple[float, ...]) -> np.ndarray:
-    """Return the sorted times of ``save_at`` and the end of the span; times at a break, to rounding, are the break."""
+def _sorted_save_times_and_end(save_at, start: float, end: float, breaks: tuple[float, ...]) -> np.ndarray:
+    """Return the sorted times of ``save_at`` and the end of the span; times at a break, to rounding, become the break.
+
+    Raises
+    ------
+    InputError
+        If ``save_at`` is not a list of finite times within the span.
+    """
     times = np.atleast_1d(np.asarray(save_at, dtype=np.float64))
     if times.ndim != 1 or not np.isfinite(times).all() or times.size == 0:
         raise InputError(f"save_at must be a list of times, got {save_at!r}")
@@ -347,8 +364,8 @@ def _save_times(save_at, start: float, end: float, breaks: tuple[float, ...]) ->
     return np.unique([*times, end])
 
 
-def clip_times_to_span(times: np.ndarray, start: float, end: float, name: str) -> np.ndarray:
-    """Return times, of which those outside the span by a rounding error are moved to its ends.
+def clip_times_to_span(times: np.ndarray, start: float, end: float, argument_name: str) -> np.ndarray:
+    """Return the times, after moving those outside the span by a rounding error to its ends.
 
     Such an error arises if a user adds times: ``0.1 + 0.1 + 0.1 > 0.3``.
 
@@ -361,7 +378,7 @@ def clip_times_to_span(times: np.ndarray, start: float, end: float, name: str) -
     invalid_times = times[~((times >= start - rounding) & (times <= end + rounding))]
     if invalid_times.size:
         raise InputError(
-            f"{name} must be times of t_span = ({start:g}, {end:g}), got {invalid_times[0]:g}, outside of it"
+            f"{argument_name} must be times of t_span = ({start:g}, {end:g}), got {invalid_times[0]:g}, outside of it"
         )
     return np.clip(times, start, end)
 
@@ -370,14 +387,14 @@ MAX_SPLIT_STEP = 1e290
 """Largest step whose products are computed in two parts, which overflow for larger ones."""
 
 
-def _time_after(start, steps, h: float) -> np.ndarray:
-    """Return ``start + steps * h``, rounded once (Dekker's product and Knuth's sum)."""
+def _add_steps_to_time(start, n_steps, h: float) -> np.ndarray:
+    """Return ``start + n_steps * h``, rounded once (Dekker's product and Knuth's sum)."""
     if h > MAX_SPLIT_STEP:
         with np.errstate(over="ignore", invalid="ignore"):
-            return start + np.asarray(steps, dtype=np.float64) * h
-    steps, (h_high, h_low) = np.asarray(steps, dtype=np.float64), _veltkamp_split(np.float64(h))
-    steps_high, steps_low = _veltkamp_split(steps)
-    product = steps * h
+            return start + np.asarray(n_steps, dtype=np.float64) * h
+    n_steps, (h_high, h_low) = np.asarray(n_steps, dtype=np.float64), _veltkamp_split(np.float64(h))
+    steps_high, steps_low = _veltkamp_split(n_steps)
+    product = n_steps * h
     rounding_error = ((steps_high * h_high - product) + steps_high * h_low + steps_low * h_high) + steps_low * h_low
     total = start + product
     increment = total - start
@@ -385,19 +402,31 @@ def _time_after(start, steps, h: float) -> np.ndarray:
     return total + rounding_error
 
 
-def _veltkamp_split(a) -> tuple[np.ndarray, np.ndarray]:
-    """Return two numbers of at most 26 bits whose sum is ``a`` (Veltkamp's splitting)."""
-    scaled_value = a * (2.0**27 + 1.0)
-    high_part = scaled_value - (scaled_value - a)
-    return high_part, a - high_part
+def _veltkamp_split(number) -> tuple[np.ndarray, np.ndarray]:
+    """Return the high and the low part of a number, of at most 26 bits each (Veltkamp's splitting)."""
+    scaled_value = number * (2.0**27 + 1.0)
+    high_part = scaled_value - (scaled_value - number)
+    return high_part, number - high_part
+
+
+def backward_span_message(start: float, end: float) -> str:
+    """Return the message of the error for a span whose end is before its start."""
+    return (
+        f"t_span must be finite and increasing, got ({start:g}, {end:g}). To find an earlier state, integrate the "
+        "equations with SciPy, which conserves no law exactly: scipy.integrate.solve_ivp(lambda t, x: "
+        f"system.vector_field(x, t), ({start!r}, {end!r}), x0, rtol=1e-10, atol=1e-12)"
+    )
 
 
 def checked_span(span, allow_infinite_end: bool = False) -> tuple[float, float]:
+    """Return start and end of a span as floats; raise InputError unless they are finite and increasing."""
     try:
         start, end = (float(t) for t in span)
     except (TypeError, ValueError):
         raise InputError(f"t_span must be two numbers (start, end), got {span!r:.60}") from None
     if not (math.isfinite(start) and end > start and (allow_infinite_end or math.isfinite(end))):
+        if -math.inf < end < start < math.inf:
+            raise InputError(backward_span_message(start, end))
         cure = "" if end != math.inf else (
             ". An infinite end needs lt.integrate with adaptive steps and an event to stop at: step=lt.Adaptive(rtol), "
             "until=event"
@@ -407,6 +436,7 @@ def checked_span(span, allow_infinite_end: bool = False) -> tuple[float, float]:
 
 
 def checked_step(step, start: float, end: float) -> float:
+    """Return the step size as a float; raise InputError unless it is positive and above the rounding of the times."""
     try:
         h = float(step)
     except (TypeError, ValueError):

@@ -21,32 +21,32 @@ from ..results.status import Laws
 from ..systems import System
 from ..tracing.interpret import evaluate_at_points
 from .adaptive import Adaptive
-from .evidence import EngineReplay, RunEvidence, series_of_functions
+from .evidence import EngineReplay, RunEvidenceSource, values_by_function_name
 
 
 class RecordedFunctions(NamedTuple):
-    """The functions that are recorded along the runs of a system.
+    """The functions and velocities whose values along a run belong to its solution.
 
     Attributes
     ----------
     invariants : dict
         Functions that the system may conserve, by name.
-    of_series : dict
-        These and the entries of the ledger, whose values along a run belong to its solution.
+    series_functions : dict
+        The invariants and the entries of the ledger.
     has_user_states : bool
-        Whether states of a run have the form that the user sees.
+        Whether the states of a run already have the user's form.
     velocity_names : tuple of str
         Names of the velocities that the system has: see :attr:`liethermo.System.motion_quantities`.
     """
 
     invariants: dict[str, Energy]
-    of_series: dict[str, Energy]
+    series_functions: dict[str, Energy]
     has_user_states: bool
     velocity_names: tuple[str, ...]
 
     @classmethod
     def from_system(cls, system: System, invariants: Mapping[str, tuple[Energy, bool | None]]) -> RecordedFunctions:
-        """Return the recorded functions, with invariants as :func:`.preparation.invariants_and_laws` returns them."""
+        """Return the recorded functions of a system, from the result of :func:`.preparation.invariants_and_laws`."""
         functions = {name: f for name, (f, _) in invariants.items()}
         has_user_states = type(system).to_user_solution is System.to_user_solution and not system.sites
         return cls(
@@ -57,15 +57,15 @@ class RecordedFunctions(NamedTuple):
 def build_solution(
     system: System,
     method,
-    x: np.ndarray,
+    states: np.ndarray,
     entropy: np.ndarray | None,
     step_sizes: Callable[[], np.ndarray],
     engine: EngineWithFallback,
     laws: Laws,
     functions: RecordedFunctions,
-    **fields,
+    **other_fields,
 ) -> Solution:
-    """Return the solution in the user's form from the states x, shape (times, n), of a run.
+    """Return the solution of a run in the user's form, from its states, shape (times, n).
 
     Parameters
     ----------
@@ -75,33 +75,41 @@ def build_solution(
         The engine of the run.
     laws : Laws
     functions : RecordedFunctions
-    **fields
-        Further fields of :class:`Solution`.
+    **other_fields
+        Other fields of :class:`Solution`.
     """
     solution = Solution(
-        x=x,
+        x=states,
         entropy=None if system.entropy is None else entropy,
-        casimirs=defer(functools.partial(series_of_functions, functions.of_series, x)),
+        casimirs=defer(functools.partial(values_by_function_name, functions.series_functions, states)),
         laws=laws,
-        evidence_source=RunEvidence(
-            system, method, functions.invariants, x, np.asarray(fields["t"]), step_sizes, EngineReplay(engine)
+        evidence_source=RunEvidenceSource(
+            system,
+            method,
+            functions.invariants,
+            states,
+            np.asarray(other_fields["t"]),
+            step_sizes,
+            EngineReplay(engine),
         ),
         velocity_sources={
-            name: functools.partial(velocities_at_states, name, system, x) for name in functions.velocity_names
+            name: functools.partial(velocities_at_states, name, system, states) for name in functions.velocity_names
         },
-        **fields,
+        **other_fields,
     )
     return solution if functions.has_user_states else system.to_user_solution(solution)
 
 
-def velocities_at_states(name: str, system: System, x: np.ndarray) -> np.ndarray:
-    """Return the velocities of a name at states of a prepared system, shape (..., n); they have the shape (..., k)."""
-    rows = np.asarray(x).reshape(-1, x.shape[-1])
-    return np.asarray(evaluate_at_points(_velocities, system, rows)[name]).reshape(*x.shape[:-1], -1)
+def velocities_at_states(velocity_name: str, system: System, states: np.ndarray) -> np.ndarray:
+    """Return one kind of velocity, shape (..., k), at states of a prepared system, shape (..., n)."""
+    rows = np.asarray(states).reshape(-1, states.shape[-1])
+    return np.asarray(evaluate_at_points(_velocities_by_name, system, rows)[velocity_name]).reshape(
+        *states.shape[:-1], -1
+    )
 
 
-def _velocities(system: System, x) -> dict[str, Any]:
-    """Return the velocities at a state, shape (n,), by their names, shape (k,) each."""
+def _velocities_by_name(system: System, x) -> dict[str, Any]:
+    """Return all velocities of a system at a state, shape (n,), as a dict from names to arrays, shape (k,)."""
     return {name: velocity(x) for name, velocity in system.motion_quantities.velocities.items()}
 
 
@@ -112,9 +120,9 @@ def run_provenance(
     span: tuple[float, float],
     save_every: int | None,
     end_time: float | None = None,
-    **entries,
+    **other_entries,
 ) -> dict[str, Any]:
-    """Return the provenance of a run as JSON data: versions, date, method, step, span and system, and more entries.
+    """Return the provenance of a run as JSON data: versions, date, method, step, span, system, ``other_entries``.
 
     ``end_time`` is the time at which the run ended, in seconds as of ``time.time()``; by default now.
     """
@@ -137,7 +145,7 @@ def run_provenance(
         "dissipation": dissipation_name(system.dissipation),
         **({"torque": system.torque_laws.name} if system.torque_laws.name else {}),
         **({"joints": {name: [start, end] for name, start, end in joint_ranges}} if joint_ranges else {}),
-        **entries,
+        **other_entries,
     }
 
 

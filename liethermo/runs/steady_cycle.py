@@ -20,7 +20,7 @@ from ..results.solution import Solution
 from ..systems import System
 from ..systems.invariants import stack_gradients
 from ..systems.kind_checks import require_system
-from ..systems.linearisation import conserved_functions, counter_components
+from ..systems.linearisation import conserved_functions, heat_counter_indices
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.programs import jit_unoptimised
 from .propagator import Propagator
@@ -42,7 +42,7 @@ PERIODICITY_RTOL = 1e-9
 """Largest difference of the vector field after a period, relative to the field, of a system that counts as periodic."""
 
 CHECKED_FRACTIONS = (0.0, 0.137, 0.381, 0.618, 0.811)
-"""Fractions of a period at which the vector field is compared with that of one period later."""
+"""Fractions of a period at which the vector field is compared with its value one period later."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +58,8 @@ class SteadyCycle:
     residual : float
         Distance of the ends of the cycle, relative to the norm of the state.
     multipliers : array, shape (m,), complex
-        Floquet multipliers: by these factors small deviations change in one period, the largest first. Directions in
-        which conserved functions change, and the counters of heat, are left out.
+        Floquet multipliers, the factors by which small deviations change in one period, the largest first. Directions
+        in which conserved functions change, and the counters of heat, are left out.
     work : float
         Work that the system receives in a period (energy); negative for an engine. The work on baths whose temperature
         depends on time is not part of it.
@@ -89,10 +89,11 @@ class SteadyCycle:
         return -self.work / heat_in if self.work < 0.0 < heat_in else np.nan
 
     def __str__(self) -> str:
-        largest = np.abs(self.multipliers).max(initial=0.0)
+        largest_multiplier = np.abs(self.multipliers).max(initial=0.0)
         return (
             f"cycle of the period {self.period:.6g}: work {self.work:.3g}, heat from the baths "
-            f"{np.array2string(self.heat, precision=3)}; largest multiplier {largest:.3g}, residual {self.residual:.1e}"
+            f"{np.array2string(self.heat, precision=3)}; largest multiplier {largest_multiplier:.3g}, "
+            f"residual {self.residual:.1e}"
         )
 
 
@@ -168,30 +169,32 @@ def steady_cycle(
     if not (isinstance(period, int | float | np.number) and np.isfinite(period) and period > 0.0):
         raise InputError(f"period must be a positive number, got {period!r}")
     _check_periodicity(system, float(period), start)
-    x = np.array(system.resting_guess() if x0 is None else system.state(x0))
-    counters = counter_components(system)
-    use = np.setdiff1d(np.arange(system.dim), counters)
+    x = np.array(system.steady_state_guess() if x0 is None else system.state(x0))
+    counters = heat_counter_indices(system)
+    mapped_components = np.setdiff1d(np.arange(system.dim), counters)
     x[counters] = 0.0
     span, propagator = (start, start + float(period)), Propagator(system, method, step)
-    end_of_period = _PeriodMap(propagator, span, tuple(breaks), x, use)
-    x[use] = end_of_period(x[use])  # a first period takes part of the transient
-    frozen = system.at_time(start)
-    functions = tuple(f for name, f in conserved_functions(frozen, x).items() if name != "energy")
-    gradients = np.zeros((0, len(use)))
-    if functions:
-        gradients = evaluate_at_points(stack_gradients, functions, x[None])[0][:, use]
-    tangents = scipy.linalg.null_space(gradients) if len(gradients) else np.eye(len(use))
-    scale, distances = float(np.linalg.norm(x[use])) or 1.0, list[float]()
+    end_of_period = _PeriodMap(propagator, span, tuple(breaks), x, mapped_components)
+    x[mapped_components] = end_of_period(x[mapped_components])  # a first period takes part of the transient
+    frozen_system = system.at_time(start)
+    invariant_functions = tuple(f for name, f in conserved_functions(frozen_system, x).items() if name != "energy")
+    gradients = np.zeros((0, len(mapped_components)))
+    if invariant_functions:
+        gradients = evaluate_at_points(stack_gradients, invariant_functions, x[None])[0][:, mapped_components]
+    tangents = scipy.linalg.null_space(gradients) if len(gradients) else np.eye(len(mapped_components))
+    scale, distances = float(np.linalg.norm(x[mapped_components])) or 1.0, list[float]()
     while len(distances) < MAX_NEWTON_STEPS:
-        end = end_of_period(x[use])
-        distances.append(float(np.linalg.norm(end - x[use])) / scale)
+        end = end_of_period(x[mapped_components])
+        distances.append(float(np.linalg.norm(end - x[mapped_components])) / scale)
         has_stalled = len(distances) > 1 and distances[-1] > STALL_RATIO * distances[-2]
         if not np.isfinite(distances[-1]) or (distances[-1] <= CYCLE_RTOL and has_stalled):
             break
-        monodromy = end_of_period.derivative(x[use], end, system.samples(len(use))[:, use])
-        matrix = np.concatenate([monodromy - np.eye(len(use)), gradients])
-        residual = np.append(x[use] - end, np.zeros(len(gradients)))
-        x[use] += np.linalg.lstsq(matrix, residual, rcond=None)[0]
+        monodromy = end_of_period.derivative_by_differences(
+            x[mapped_components], end, system.samples(len(mapped_components))[:, mapped_components]
+        )
+        matrix = np.concatenate([monodromy - np.eye(len(mapped_components)), gradients])
+        residual = np.append(x[mapped_components] - end, np.zeros(len(gradients)))
+        x[mapped_components] += np.linalg.lstsq(matrix, residual, rcond=None)[0]
     if not distances[-1] <= CYCLE_RTOL:
         raise ConvergenceError(
             f"no cycle of the period {period:g} was found: after {len(distances)} steps its ends differ by "
@@ -230,17 +233,17 @@ def _check_periodicity(system: System, period: float, start: float) -> None:
     """Raise InputError unless the vector field repeats itself after a period, at a few states and times."""
     points = jnp.asarray(system.samples(3))
     times = start + period * np.array(CHECKED_FRACTIONS)
-    fields = np.asarray(_vector_fields(system, points, jnp.asarray([times, times + period])))
-    difference, size = np.abs(fields[1] - fields[0]).max(), np.abs(fields[0]).max()
-    if not difference <= PERIODICITY_RTOL * max(size, np.finfo(float).tiny) * max(1.0, abs(start) + period):
+    fields = np.asarray(_vector_field_at_points_and_times(system, points, jnp.asarray([times, times + period])))
+    difference, field_norm = np.abs(fields[1] - fields[0]).max(), np.abs(fields[0]).max()
+    if not difference <= PERIODICITY_RTOL * max(field_norm, np.finfo(float).tiny) * max(1.0, abs(start) + period):
         raise InputError(
             f"this {system.kind} does not repeat itself after the period {period:g}: its vector field then differs by "
-            f"{difference / size:.2g} of its size. Functions of time have to be periodic for all times"
+            f"{difference / field_norm:.2g} of its size. Functions of time have to be periodic for all times"
         )
 
 
 @jit_unoptimised
-def _vector_fields(system: System, points, times) -> jax.Array:
+def _vector_field_at_points_and_times(system: System, points, times) -> jax.Array:
     """Return the vector field at all times and points, shape ``(*times, points, n)``, in one program.
 
     Evaluated one operation after another, the field of a drive with baths takes much longer than the run.
@@ -250,7 +253,7 @@ def _vector_fields(system: System, points, times) -> jax.Array:
 
 
 class _PeriodMap(NamedTuple):
-    """The map of one period on the components of a state that do not only count.
+    """The map of a state over one period, restricted to the components that are not counters of heat.
 
     Attributes
     ----------
@@ -258,27 +261,31 @@ class _PeriodMap(NamedTuple):
     span : (float, float)
     breaks : tuple of float
     x : array, shape (n,)
-        A state, for the components that only count.
-    use : array of int, shape (m,)
-        The other components.
+        A state with the initial values of the counters.
+    mapped_components : array of int, shape (m,)
+        Indices of the components that are no counters.
     """
 
     propagator: Propagator
     span: tuple[float, float]
     breaks: tuple[float, ...]
     x: np.ndarray
-    use: np.ndarray
+    mapped_components: np.ndarray
 
-    def __call__(self, y: np.ndarray) -> np.ndarray:
+    def __call__(self, start_components: np.ndarray) -> np.ndarray:
         x = self.x.copy()
-        x[self.use] = y
-        return np.asarray(self.propagator(x, self.span, save_every=CHUNK_STEPS, breaks=self.breaks).x[-1])[self.use]
+        x[self.mapped_components] = start_components
+        return np.asarray(self.propagator(x, self.span, save_every=CHUNK_STEPS, breaks=self.breaks).x[-1])[
+            self.mapped_components
+        ]
 
-    def derivative(self, y: np.ndarray, end: np.ndarray, samples: np.ndarray) -> np.ndarray:
-        """Return the derivative of the map, shape (m, m), by differences towards random states, shape (m, m).
+    def derivative_by_differences(
+        self, start_components: np.ndarray, end_components: np.ndarray, samples: np.ndarray
+    ) -> np.ndarray:
+        """Return the derivative of the map, shape (m, m), by finite differences towards ``samples``, shape (m, m).
 
-        A point between two states of a convex set, such as density matrices, belongs to it.
+        Points between two states of a convex set, such as density matrices, belong to the set.
         """
-        displacements = DIFFERENCE_STEP * (samples - y)
-        changes = np.stack([self(y + d) - end for d in displacements])
+        displacements = DIFFERENCE_STEP * (samples - start_components)
+        changes = np.stack([self(start_components + d) - end_components for d in displacements])
         return np.linalg.lstsq(displacements, changes, rcond=None)[0].T

@@ -143,7 +143,7 @@ def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> M
         except LiethermoError as error:
             refusals.append(f"{method}: {error}")
     if not trials:
-        raise InputError("; ".join(refusals))
+        raise InputError("no method takes steps of this accuracy from this x0: " + "; ".join(refusals))
     trials.sort(key=lambda trial: trial.evaluations)
     cheapest, explicit_trials = trials[0], [trial for trial in trials if trial.method.explicit]
     if cheapest.method.explicit:
@@ -158,30 +158,41 @@ def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> M
 
 
 def _try_method(system: System, x0, rtol: float, method: OneStepMethod, t0: float) -> Trial:
+    """Take up to thirty adaptive steps from x0 with a method, and return its step size and its work.
+
+    Raises
+    ------
+    InputError
+        If nothing moves at x0, or the method takes no step of this accuracy.
+    """
     system, prepared_method = prepare_for_method(system, method, rtol)
     prepared_method.check(system)
     x = np.asarray(checked_initial_state(system, prepared_method, x0, t0))
     max_rate, norm = float(np.abs(np.asarray(system.vector_field(x))).max()), float(np.abs(x).max())
     if not max_rate > 0.0:
-        raise InputError("nothing moves at this state, so there is no step to suggest: start elsewhere")
+        raise InputError("the vector field is zero at this x0, so there is no step to suggest. Give another x0")
     step_sizes: list[float] = []
     iterations = [0]
 
-    def record_first_step(steps: AcceptedSteps):
-        step_sizes.append(float(steps.h[0]))
-        iterations.append(int(steps.state_after.fixed_point_iterations) + int(steps.state_after.newton_iterations))
+    def record_step_size_and_iterations(accepted_steps: AcceptedSteps):
+        step_sizes.append(float(accepted_steps.h[0]))
+        iterations.append(
+            int(accepted_steps.state_after.fixed_point_iterations) + int(accepted_steps.state_after.newton_iterations)
+        )
         if len(step_sizes) == 30:
             raise _TrialCompleteError
 
     def run_trial(rate: float) -> AdaptiveRun:
-        """Take up to thirty steps over a span of 1e6 / rate."""
+        """Take up to thirty adaptive steps over a span of length 1e6 / rate, and return the run."""
         step_sizes.clear()
         iterations[1:] = []
-        length = 1e6 / rate
-        control = make_step_control(Adaptive(rtol), prepared_method, length, None)
-        adaptive_runs = engine.start_adaptive(control, x, 0.0, length, length)
-        stops = np.array([length])
-        run = AdaptiveRun(engine, adaptive_runs, control, stops, record_first_step, attempts_per_call=1)
+        span_length = 1e6 / rate
+        control = make_step_control(Adaptive(rtol), prepared_method, span_length, None)
+        adaptive_runs = engine.start_adaptive(control, x, 0.0, span_length, span_length)
+        stop_times = np.array([span_length])
+        run = AdaptiveRun(
+            engine, adaptive_runs, control, stop_times, record_step_size_and_iterations, attempts_per_call=1
+        )
         run.advance_to_end()  # one attempt a call, since iterations are counted
         return run
 
@@ -193,7 +204,10 @@ def _try_method(system: System, x0, rtol: float, method: OneStepMethod, t0: floa
         ):
             run_trial(growth)  # near an equilibrium, steps resolve the growth rate and not the slow motion
     if len(step_sizes) < 2:
-        raise InputError(f"no step from this state is as accurate as {rtol:g}: {len(step_sizes)} steps were taken")
+        raise InputError(
+            f"{method} took {len(step_sizes)} steps of the accuracy rtol = {rtol:g} from this x0, and 2 are needed. "
+            "Give a larger rtol or another x0"
+        )
     n_growing = next((i for i, (a, b) in enumerate(pairwise(step_sizes)) if b < DEADBAND[1] * a), len(step_sizes) - 1)
     h = min(step_sizes[n_growing:])
     digits = 1 - math.floor(math.log10(h))
@@ -206,4 +220,4 @@ def _try_method(system: System, x0, rtol: float, method: OneStepMethod, t0: floa
 
 
 class _TrialCompleteError(Exception):
-    """Ends a trial after enough steps."""
+    """Exception that ends a trial run after enough steps."""

@@ -22,7 +22,7 @@ from ..systems.kind_checks import require_system
 from ..tracing.caching import fingerprint
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.traced import TracedFunction, trace_function
-from .named_parameters import arrays_with_members, find_parameter, refused_members
+from .named_parameters import reasons_of_refused_members, require_parameter, stack_member_arrays
 
 MAX_CHECKED_MEMBERS = 8
 """Largest number of members that are built and checked one by one at a time."""
@@ -37,7 +37,7 @@ class Family:
 
     Attributes
     ----------
-    form : ProgramStructure
+    program_structure : ProgramStructure
         Builds a member from its parameters, a list of arrays.
     parameter_arrays : list of ndarray
         The parameters of all members along the first axis, which has length 1 if all members share them.
@@ -55,7 +55,7 @@ class Family:
         row. A selection of one member keeps these flags, so the same program runs it.
     """
 
-    form: ProgramStructure
+    program_structure: ProgramStructure
     parameter_arrays: list[np.ndarray]
     common_system: System | None = None
     example: System | None = None
@@ -84,7 +84,7 @@ class Family:
             raise InputError("a function that builds systems needs parameters=..., one set for each trajectory")
         family = cls.from_function(system, parameters)
         # constructors of systems check their arguments, but a traced program does not
-        refusal_reasons = family.rejection_reasons(lambda i: error_message_of(lambda: family.member(i)))
+        refusal_reasons = family.find_rejection_reasons(lambda i: error_message_or_empty(lambda: family.member(i)))
         return replace(family.trace_builder(), refusal_reasons=refusal_reasons)
 
     @classmethod
@@ -99,14 +99,14 @@ class Family:
                 "For parameters of another form, give a function that builds the system"
             )
         for name, values in parameters.items():
-            has_moments = name.endswith("inertia") and find_parameter(system, name).value.shape == (3,)
+            has_moments = name.endswith("inertia") and require_parameter(system, name).value.shape == (3,)
             if has_moments and are_inertia_tensors(np.asarray(values, dtype=np.float64)):
                 raise InputError(
                     f"the values of {name} are the tensor of inertia of one body, but three sets of principal moments "
                     "are expected. Give the moments of each trajectory as a row, or a system with a tensor"
                 )
-        arrays = arrays_with_members(system, parameters)
-        reasons = refused_members(system, arrays)
+        arrays = stack_member_arrays(system, parameters)
+        reasons = reasons_of_refused_members(system, parameters)
         return cls(
             ProgramStructure.from_module(system), arrays, None if parameters else system, refusal_reasons=reasons
         )
@@ -137,14 +137,15 @@ class Family:
         """
         static_part = None
 
-        def arrays_of(*arrays):
+        def arrays_of_built_system(*arrays):
             nonlocal static_part
-            arrays, static_part = eqx.partition(self.form.rebuild(list(arrays)), eqx.is_array)
+            arrays, static_part = eqx.partition(self.program_structure.rebuild(list(arrays)), eqx.is_array)
             return arrays
 
         try:
             program = trace_function(
-                arrays_of, *(jax.ShapeDtypeStruct(shape, np.float64) for shape in self.form.shapes)
+                arrays_of_built_system,
+                *(jax.ShapeDtypeStruct(shape, np.float64) for shape in self.program_structure.shapes),
             )
         except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
             raise InputError(
@@ -167,42 +168,44 @@ class Family:
         form = ProgramStructure(
             (program.program, fingerprint(static_part)), tuple(value.shape[1:] for value in values), rebuild
         )
-        return replace(self, form=form, parameter_arrays=values)
+        return replace(self, program_structure=form, parameter_arrays=values)
 
     def with_builder_arrays(self, builder_arrays: list[np.ndarray]) -> Family:
-        """Return the family with other arguments of its builder."""
+        """Return the family with these arrays as the arguments of the function that builds its members."""
         return replace(
             self,
             parameter_arrays=[*builder_arrays, *self.parameter_arrays[self.n_builder_arrays :]],
             has_member_axis=(),
         )
 
-    def map_members(self, change: Callable[..., System], *arguments: Hashable) -> Family:
-        """Return the family of the systems ``change(member, *arguments)``; the function ``change`` must be hashable."""
-        form = self.form
-        key = form.key, change, arguments
-        form_of_changed = ProgramStructure(key, form.shapes, lambda arrays: change(form.rebuild(arrays), *arguments))
+    def map_members(self, change_member: Callable[..., System], *arguments: Hashable) -> Family:
+        """Return the family whose members are ``change_member(member, *arguments)``; the function must be hashable."""
+        form = self.program_structure
+        key = form.key, change_member, arguments
+        form_of_changed = ProgramStructure(
+            key, form.shapes, lambda arrays: change_member(form.rebuild(arrays), *arguments)
+        )
         return Family(form_of_changed, self.parameter_arrays, has_member_axis=self.has_member_axis)
 
-    def annotate_members(self, annotate: Callable[..., System], *arguments: Hashable) -> Family:
-        """Return the family of the systems ``annotate(member, *arguments)``; a common system remains common."""
+    def annotate_members(self, annotate_member: Callable[..., System], *arguments: Hashable) -> Family:
+        """Return the family of the systems ``annotate_member(member, *arguments)``; a common system remains common."""
         if self.common_system is not None:
-            return Family.from_arguments(annotate(self.common_system, *arguments), None)
-        return self.map_members(annotate, *arguments)
+            return Family.from_arguments(annotate_member(self.common_system, *arguments), None)
+        return self.map_members(annotate_member, *arguments)
 
-    def map_members_with_shared_numbers(self, change: Callable[..., System], *numbers: float) -> Family:
-        """Return the family of the systems ``change(member, *numbers)``; the function ``change`` must be hashable.
+    def map_members_with_shared_numbers(self, change_member: Callable[..., System], *numbers: float) -> Family:
+        """Return the family whose members are ``change_member(member, *numbers)``; the function must be hashable.
 
         The numbers become parameters, so families with other numbers share the compiled program.
         """
-        form, count = self.form, len(numbers)
+        form, count = self.program_structure, len(numbers)
 
         def rebuild(arrays):
-            return change(form.rebuild(arrays[:-count]), *arrays[-count:])
+            return change_member(form.rebuild(arrays[:-count]), *arrays[-count:])
 
         values = [*self.parameter_arrays, *(np.array([number]) for number in numbers)]
         return Family(
-            ProgramStructure((form.key, change, count), (*form.shapes, *[()] * count), rebuild),
+            ProgramStructure((form.key, change_member, count), (*form.shapes, *[()] * count), rebuild),
             values,
             has_member_axis=self.has_member_axis,
         )
@@ -214,48 +217,54 @@ class Family:
         """Number of members."""
         return broadcast_size(*(len(value) for value, has_axis in self._arrays_with_axis_flags if has_axis))
 
-    def member_arrays(self, i: int) -> list[jax.Array]:
-        """Return the parameter arrays of member i."""
-        return [jnp.asarray(value[i if has_axis else 0]) for value, has_axis in self._arrays_with_axis_flags]
+    def member_arrays(self, member_index: int) -> list[jax.Array]:
+        """Return the list of the parameter arrays of one member, without the axis of members."""
+        return [jnp.asarray(value[member_index if has_axis else 0]) for value, has_axis in self._arrays_with_axis_flags]
 
     @property
     def _arrays_with_axis_flags(self) -> list[tuple[np.ndarray, bool]]:
         return list(zip(self.parameter_arrays, self.has_member_axis, strict=True))
 
-    def member(self, i: int) -> System:
-        return self.form.rebuild(self.member_arrays(i)) if self.common_system is None else self.common_system
+    def member(self, member_index: int) -> System:
+        return (
+            self.program_structure.rebuild(self.member_arrays(member_index))
+            if self.common_system is None
+            else self.common_system
+        )
 
     @property
     def representative(self) -> System:
-        """The member that is reported for all: the example if there is one, otherwise the first."""
+        """The member that provenance and messages describe: the example if there is one, otherwise the first."""
         return self.member(0) if self.example is None else self.example
 
-    def with_unknown_parameters(self) -> System:
-        """Return a member whose parameters are NaN where those of the members differ."""
+    def member_with_unknown_parameters(self) -> System:
+        """Return a system with the parameters that all members share, and NaN for those that differ."""
         arrays = zip(self.parameter_arrays, self.has_member_axis, strict=True)
-        return self.form.rebuild([np.full(a.shape[1:], np.nan) if differ else a[0] for a, differ in arrays])
+        return self.program_structure.rebuild(
+            [np.full(a.shape[1:], np.nan) if differ else a[0] for a, differ in arrays]
+        )
 
     def members_with_extreme_parameters(self) -> list[int]:
-        """Return members with the smallest and largest parameters, which are the likeliest to be out of range."""
+        """Return the indices of members with the smallest and largest parameters, the likeliest to be out of range."""
         indices = {0: None}
         for value in self.parameter_arrays:
             rows = value.reshape(len(value), -1)
             indices |= dict.fromkeys(int(i) for i in (*rows.argmin(axis=0), *rows.argmax(axis=0)))
         return list(indices)[:MAX_CHECKED_MEMBERS]
 
-    def rejection_reasons(
-        self, reason: Callable[[int], str], known_reasons: Mapping[int, str] | None = None
+    def find_rejection_reasons(
+        self, reason_of_member: Callable[[int], str], known_reasons: Mapping[int, str] | None = None
     ) -> dict[int, str]:
-        """Return the members that cannot be run, with the reasons.
+        """Return the reasons why some members cannot be run, by member index.
 
         Members with extreme parameters are tried; if some fail, the most extreme of the remaining ones are tried next.
 
         Parameters
         ----------
-        reason : function from a member's number to a text
+        reason_of_member : function of a member index
             Returns why the member cannot be run, or "".
         known_reasons : dict, optional
-            Members that are already rejected.
+            Reasons of members that are already rejected.
 
         Raises
         ------
@@ -270,7 +279,7 @@ class Family:
                 for i in map(int, candidates[self.select(candidates).members_with_extreme_parameters()])
                 if i not in tried_reasons
             ]
-            tried_reasons |= {i: reason(i) for i in new_members}
+            tried_reasons |= {i: reason_of_member(i) for i in new_members}
             failures = {i: tried_reasons[i] for i in new_members if tried_reasons[i]}
             reasons |= failures
             candidates = np.setdiff1d(candidates, list(failures))
@@ -281,18 +290,18 @@ class Family:
             raise InputError(f"no trajectory can be started; trajectory {first_member}: {reasons[first_member]}")
         return reasons
 
-    def axiom_violation_text(self, i: int, x: np.ndarray) -> str:
-        """Return the report or error of the axiom check of member i at x, or "" if it passes."""
+    def axiom_violation_text(self, member_index: int, x: np.ndarray) -> str:
+        """Return the report or error of the axiom check of a member at x, or "" if the check passes."""
         report = None
 
         def check():
             nonlocal report
-            report = self.member(i).check(points=x)
+            report = self.member(member_index).check(points=x)
 
-        return error_message_of(check) or ("" if report is None or report.passed else str(report))
+        return error_message_or_empty(check) or ("" if report is None or report.passed else str(report))
 
     def _reasons_of_members_with_nan(self) -> dict[int, str]:
-        """Return the members that have NaN among their parameters, with a reason."""
+        """Return a reason for each member that has NaN among its parameters, by member index."""
         is_nan = np.zeros(self.size, dtype=bool)
         # a NaN that all members share may be a constant of a function, such as a table beyond its ends
         for value in self.parameter_arrays[: self.n_builder_arrays] or [
@@ -301,16 +310,16 @@ class Family:
             is_nan |= np.isnan(value.reshape(len(value), -1)).any(axis=1)
         return {int(i): "one of its parameters is NaN" for i in np.flatnonzero(is_nan)}
 
-    def select(self, members: np.ndarray) -> Family:
-        """Return the family of the selected members."""
-        values = [value[members] if has_axis else value for value, has_axis in self._arrays_with_axis_flags]
+    def select(self, member_indices: np.ndarray) -> Family:
+        """Return the family of the members with these indices."""
+        values = [value[member_indices] if has_axis else value for value, has_axis in self._arrays_with_axis_flags]
         return replace(self, parameter_arrays=values, refusal_reasons={})
 
-    # -- as the engines take them -----------------------------------------------------------------------------------
+    # -- parameters in the form of the engines ----------------------------------------------------------------------
 
     @property
     def is_per_trajectory(self) -> np.ndarray:
-        """Mask of the entries of the joined parameter arrays that differ between members, shape (p,)."""
+        """Mask, shape (p,), of the parameter entries that differ between trajectories."""
         return np.concatenate(
             [np.zeros(0, bool), *(np.full(value[0].size, has_axis) for value, has_axis in self._arrays_with_axis_flags)]
         )
@@ -321,19 +330,22 @@ class Family:
         columns = [np.broadcast_to(row.reshape(len(row), -1), (n_members, row[0].size)) for row in rows]
         return np.concatenate([np.zeros((n_members, 0)), *columns], axis=1)
 
-    def evaluate(self, function: Callable, members: slice | np.ndarray, x: np.ndarray) -> Any:
-        """Return ``function(member, x)`` for each of the selected members at its own state, with members first.
+    def evaluate(self, function: Callable, members: slice | np.ndarray, states: np.ndarray) -> Any:
+        """Return ``function(member, state)`` for each of the selected members, with members along the first axis.
 
         Parameters
         ----------
         function : function from a System and an array, shape (n,), to a pytree of float64 arrays
-            It must not be a closure made anew for each call, because compiled versions are cached by its identity.
+            The function must not be a closure that is created for each call, because compiled versions are cached by
+            its identity.
         members : slice, or array of int, shape (m,)
-        x : array, shape (m, n)
+        states : array, shape (m, n)
         """
-        parameters = self.parameter_matrix(members, len(x))
-        rows = np.concatenate([parameters, x], axis=1)
-        return evaluate_at_points(_function_of_row(function), (self.form, parameters.shape[1]), rows)
+        parameters = self.parameter_matrix(members, len(states))
+        rows = np.concatenate([parameters, states], axis=1)
+        return evaluate_at_points(
+            _function_of_parameter_and_state_row(function), (self.program_structure, parameters.shape[1]), rows
+        )
 
     def vmap_arguments(self, members: slice | np.ndarray) -> tuple[list[jax.Array], list[Any]]:
         """Return the parameter arrays of the selected members, and their axes for ``jax.vmap``."""
@@ -344,18 +356,19 @@ class Family:
 
 
 def broadcast_size(*sizes: int) -> int:
-    """Return the common size of axes that broadcast, each 1 or the number of trajectories."""
+    """Return the number of trajectories to which axes of these sizes broadcast; each is 1 or this number."""
     distinct_sizes = {size for size in sizes if size != 1}
     if len(distinct_sizes) > 1:
         raise InputError(
-            f"initial states and parameters are for different numbers of trajectories: {sorted(distinct_sizes)}"
+            f"initial states, attitudes and parameters are for {' and '.join(map(str, sorted(distinct_sizes)))} "
+            "trajectories. Give one of each for all trajectories, or equal numbers"
         )
     if 0 in distinct_sizes:
-        raise InputError("an ensemble has at least one trajectory")
+        raise InputError("an ensemble needs at least one trajectory, got 0 initial states or sets of parameters")
     return distinct_sizes.pop() if distinct_sizes else 1
 
 
-def error_message_of(call: Callable[[], Any]) -> str:
+def error_message_or_empty(call: Callable[[], Any]) -> str:
     """Return the message of the error that ``call()`` raises, or ""."""
     try:
         call()
@@ -365,14 +378,14 @@ def error_message_of(call: Callable[[], Any]) -> str:
 
 
 @functools.cache
-def _function_of_row(function: Callable) -> Callable:
-    """Return the function of a program structure, and of a row of p parameters and a state.
+def _function_of_parameter_and_state_row(function: Callable) -> Callable:
+    """Return ``function(system, x)`` as a function of a program structure and of a row of parameters and state.
 
-    It is one for each ``function``, because compiled versions are cached by its identity.
+    The result is cached, because compiled versions are cached by its identity.
     """
 
     def evaluate_row(model: tuple[ProgramStructure, int], row):
-        form, p = model
-        return function(form.build(row[:p]), row[p:])
+        structure, n_parameters = model
+        return function(structure.build(row[:n_parameters]), row[n_parameters:])
 
     return evaluate_row

@@ -18,8 +18,9 @@ from ..results.step_sampling import vector_field_at
 from ..systems import System
 from .adaptive import Adaptive
 
-RETRY_DIVISORS = (2.0, 8.0, 64.0, 1024.0, 16384.0)
-"""Divisors of a failed step size; the quotients are tried, to advise a smaller step."""
+RETRY_DIVISORS = (2.0, 8.0, 64.0, 1024.0, 2.0**14, 2.0**20, 2.0**27)
+"""Divisors of a failed step size; the quotients are tried, to advise a smaller step. The largest are for rates that
+contain an exponential, as those of jumps in a cold bath do."""
 
 BLOW_UP_SIZE = float(np.finfo(float).max) ** 0.25
 """Norm of a state that counts as unbounded; a quartic function overflows there."""
@@ -50,20 +51,20 @@ BLOW_UP_ADVICE = "No step helps there: does the energy have a lower bound, and d
 """Advice at the end of messages about unbounded growth."""
 
 
-def run_statistics(state: State, wall_time: float, n_rejected: int = 0) -> Stats:
-    """Return the work counters and extreme values of an engine state."""
-    has_steps = int(state.step) > 0
+def run_statistics(final_state: State, wall_time: float, n_rejected: int = 0) -> Stats:
+    """Return the work counters and extreme values of a run from its final engine state."""
+    has_steps = int(final_state.step) > 0
     return Stats(
-        steps=int(state.step),
-        fixed_point_iterations=int(state.fixed_point_iterations),
-        newton_iterations=int(state.newton_iterations),
+        steps=int(final_state.step),
+        fixed_point_iterations=int(final_state.fixed_point_iterations),
+        newton_iterations=int(final_state.newton_iterations),
         rejected=n_rejected,
         wall_time=wall_time,
-        most_iterations=int(state.most_iterations),
-        worst_residual=float(state.worst_residual),
-        energy_range=(float(state.smallest_energy), float(state.largest_energy)) if has_steps else None,
-        least_entropy_increment=float(state.least_entropy_increment) if has_steps else None,
-        largest_energy_increment=float(state.largest_energy_increment) if has_steps else None,
+        most_iterations=int(final_state.most_iterations),
+        worst_residual=float(final_state.worst_residual),
+        energy_range=(float(final_state.smallest_energy), float(final_state.largest_energy)) if has_steps else None,
+        least_entropy_increment=float(final_state.least_entropy_increment) if has_steps else None,
+        largest_energy_increment=float(final_state.largest_energy_increment) if has_steps else None,
     )
 
 
@@ -72,7 +73,7 @@ SUFFICIENT_ORDER = 6
 
 
 def higher_order_advice(method: OneStepMethod, step: Adaptive) -> str:
-    """Return the advice to use a method of higher order, or "" if its order is high enough."""
+    """Return the advice to use a method of higher order, or "" if the order of the method is high enough."""
     if method.order >= SUFFICIENT_ORDER:
         return ""
     better = "lt.MetriplecticRungeKutta(8)" if method.explicit else "lt.MetriplecticGauss(4)"
@@ -85,8 +86,7 @@ def higher_order_advice(method: OneStepMethod, step: Adaptive) -> str:
 def adaptive_failure_status(
     system: System, method: OneStepMethod, x0, outcome, step: Adaptive, span: tuple[float, float], t: float
 ) -> Status:
-    """Return the status of an adaptive run that stopped before its end at time t: step size, step count or memory ran
-    out."""
+    """Return the status of an adaptive run that stopped at time t because step size, step count or memory ran out."""
     (start, end), steps, residual = span, int(outcome.state.step), float(outcome.state.residual)
     x = np.asarray(outcome.state.x)
     if outcome.exhausted_limit != "memory" and (
@@ -116,23 +116,23 @@ def adaptive_failure_status(
     return Status(StatusCode.STEP_UNDERFLOW, text, steps, t, residual)
 
 
-def event_status(outcome, names: Sequence[str], t: float) -> Status:
+def event_status(outcome, event_names: Sequence[str], t: float) -> Status:
     """Return the status of a run that ended at an event, or where an event function is NaN, at time t."""
     steps, residual = int(outcome.state.step), float(outcome.state.residual)
     if outcome.event_time is not None:
-        name = names[outcome.occurrences[-1].function]
+        name = event_names[outcome.occurrences[-1].function]
         return Status(StatusCode.EVENT, f"{name}: reached at t = {t:.6g} in {steps} steps", steps, t, residual)
-    name = names[outcome.undefined_events[0] if outcome.undefined_events else 0]
+    name = event_names[outcome.undefined_events[0] if outcome.undefined_events else 0]
     text = (
         f"{name} is NaN near t = {t:g} between values of opposite sign, so its zero cannot be located. Define it there"
     )
     return Status(StatusCode.NON_FINITE, text, steps, t, residual)
 
 
-def event_remarks(outcome, names: Sequence[str], terminal_counts: Sequence[int | None]) -> str:
-    """Return what a message says of the events of a run that reached its end."""
+def event_remarks(outcome, event_names: Sequence[str], terminal_counts: Sequence[int | None]) -> str:
+    """Return the sentences on events that did or did not happen, for the message of a run that reached its end."""
     text = ""
-    for k, name in enumerate(names):
+    for k, name in enumerate(event_names):
         jumps, n_events = (
             [t for j, t in outcome.sign_jumps if j == k],
             sum(e.function == k for e in outcome.occurrences),
@@ -168,15 +168,14 @@ def blow_up_message_or_empty(x: np.ndarray, x0: np.ndarray, velocity: np.ndarray
 
 
 def _does_norm_double_within(x: np.ndarray, velocity: np.ndarray, time: float) -> bool:
-    """Return True if a state moves outwards so fast that its norm doubles within a time."""
+    """Return whether a state moves outwards so fast that its norm doubles within this time."""
     norm = np.abs(x).max()
     with np.errstate(all="ignore"):
         return bool(np.abs(velocity).max() * time > norm > 0.0 and np.dot(x / norm, velocity) > 0.0)
 
 
 def _blow_up_text_from_shorter_steps(engine: EngineWithFallback, state, t: float, h: float) -> str:
-    """Retry a failed step of size h with shorter steps; return a message if they show unbounded growth, otherwise
-    ""."""
+    """Return a message if shorter steps in place of a failed step of size h show unbounded growth, otherwise ""."""
     x, probe_time, probe_step_size = np.asarray(state.x), 0.0, h / 8.0
     norm, velocity = np.abs(x).max(), vector_field_at(engine.system, x[None])[0]
     if not _does_norm_double_within(x, velocity, BLOW_UP_HORIZON_STEPS * h):
@@ -202,7 +201,7 @@ def _blow_up_text_from_shorter_steps(engine: EngineWithFallback, state, t: float
     return ""
 
 
-def ensemble_failure_message(
+def ensemble_blow_up_message_or_empty(
     x: np.ndarray, x0: np.ndarray, velocity: np.ndarray, time_elapsed: float, t: float, h: float
 ) -> str:
     """Return a message if a failed trajectory of an ensemble grows without bound, otherwise "".
@@ -222,8 +221,8 @@ INTERRUPTING_ERRORS = (KeyboardInterrupt, MemoryError, jax.errors.JaxRuntimeErro
 """Errors that stop a run without a fault of the system; the states so far are returned."""
 
 
-def interruption_reason(error: BaseException) -> str:
-    """Return in words why a run was interrupted; raise the error again if it is no interruption."""
+def interruption_reason_or_reraise(error: BaseException) -> str:
+    """Return the reason of an interruption as a text, such as "by the user"; raise any other error again."""
     if isinstance(error, KeyboardInterrupt):
         return "by the user"
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
@@ -248,57 +247,69 @@ def final_status(engine: EngineWithFallback, state, t: float, h: float, interrup
         message = (
             f"the corrections of {step_text} did not reach the levels that the laws ask for: they miss them by "
             f"{residual:.2g} relative to the state (wanted: rounding, below {DEFAULT_OPTIONS.projection_rtol:.0e} of "
-            "the step). " + _step_size_advice(engine, state, h)
+            "the step). " + _try_shorter_steps_and_advise(engine, state, h)
         )
         return Status(StatusCode.NOT_CONVERGED, message, step, t, residual)
     if code == StatusCode.NOT_CONVERGED:
         message = (
             f"the equations of {step_text} were not solved: the iteration stopped at a residual of {residual:.2g} "
             f"relative to the state (wanted: rounding, below {DEFAULT_OPTIONS.plateau_rtol:.0e}). "
-            + _step_size_advice(engine, state, h)
+            + _try_shorter_steps_and_advise(engine, state, h)
         )
         return Status(StatusCode.NOT_CONVERGED, message, step, t, residual)
-    if engine.system.surface is not None and (
+    if engine.system.constraint_surface is not None and (
         reason := engine.system.domain.why_outside(_predicted_state(engine, state, h))
     ):
         text = f"{step_text}, could not be taken: {reason}. Try a smaller step, where the motion itself stays inside"
         return Status(StatusCode.NON_FINITE, text, step, t, residual)
+    shorter_step = _step_size_that_succeeds(engine, state, h)
+    advice = (
+        "Check the domain of your functions along the trajectory, or try a smaller step"
+        if shorter_step is None
+        else f"Try a smaller step, for example {shorter_step:g}"
+    )
     message = (
         f"NaN or infinity in {step_text}: the energy, the entropy or the vector field is not finite there "
-        f"({_why_non_finite(engine, state, h)}). Check the domain of your functions along the trajectory, or try "
-        "a smaller step"
+        f"({_reason_of_non_finite_step(engine, state, h)}). {advice}"
     )
     return Status(StatusCode.NON_FINITE, message, step, t, residual)
 
 
-def _step_size_advice(engine: EngineWithFallback, state, h: float) -> str:
+def _try_shorter_steps_and_advise(engine: EngineWithFallback, state, h: float) -> str:
     """Return advice on a failed step of size h, after trying shorter steps: a size that succeeds, or that none does."""
-    state = state._replace(status=jnp.zeros_like(jnp.asarray(state.status)))
-    for divisor in RETRY_DIVISORS:
-        if int(engine.step(state, h / divisor).status) == StatusCode.COMPLETED:
-            stiff = (
-                "; if that is far below what the motion needs, it is stiff or not smooth, and lt.MetriplecticGauss "
-                "takes long steps"
-            )
-            return f"Try a smaller step, for example {h / divisor:g}{stiff if engine.method.explicit else ''}"
+    if (shorter_step := _step_size_that_succeeds(engine, state, h)) is not None:
+        stiff = (
+            "; if that is far below what the motion needs, it is stiff or not smooth, and lt.MetriplecticGauss "
+            "takes long steps"
+        )
+        return f"Try a smaller step, for example {shorter_step:g}{stiff if engine.method.explicit else ''}"
     return (
         f"Steps down to {h / RETRY_DIVISORS[-1]:g} were tried and do not help: the functions may not be smooth there, "
         "or lose more digits than the iteration expects, as differences of large terms do"
     )
 
 
-def _predicted_state(engine: EngineWithFallback, state, h: float) -> jax.Array:
-    """Return the state, shape (n,), to which a step of size h along the last slope leads.
+def _step_size_that_succeeds(engine: EngineWithFallback, state, h: float) -> float | None:
+    """Return the size of a step from a state that succeeds, shorter than the failed size h; None if none is found."""
+    state = state._replace(status=jnp.zeros_like(jnp.asarray(state.status)))
+    for divisor in RETRY_DIVISORS:
+        if int(engine.step(state, h / divisor).status) == StatusCode.COMPLETED:
+            return h / divisor
+    return None
 
-    The method applies the displacement, because slopes may differ in shape from states, as those of a body with an
+
+def _predicted_state(engine: EngineWithFallback, state, h: float) -> jax.Array:
+    """Return the state, shape (n,), at the end of an Euler step of size h along the last slope.
+
+    The method applies the displacement, because slopes may differ in shape from states, for example for a body with an
     attitude.
     """
     displacement = h * jnp.nan_to_num(jnp.asarray(state.k[0]))
     return engine.method.displace(engine.system, jnp.asarray(state.x), displacement)
 
 
-def _why_non_finite(engine: EngineWithFallback, state, h: float) -> str:
-    """Return in words which function is not finite at the predicted end of the failed step."""
+def _reason_of_non_finite_step(engine: EngineWithFallback, state, h: float) -> str:
+    """Return a text that says which function is not finite at the predicted end of a failed step."""
     system = engine.system
     predicted_state = _predicted_state(engine, state, h)
     if reason := system.domain.why_outside(predicted_state):

@@ -23,7 +23,7 @@ MAX_SAMPLED_VALUES = 2**22
 """Largest number of values that are compared, which bounds time and memory for large systems."""
 
 MIN_SAMPLED_INTERVALS = 256
-"""Smallest number of intervals that is worth a look: systems that are too large for it are not examined."""
+"""Smallest number of intervals with which a search makes sense; systems too large for it are not searched."""
 
 FEATURE_CHANGE = 0.1
 """Change within an interval, as a fraction of the range over the span, that makes a feature."""
@@ -43,7 +43,7 @@ class UndeclaredFeatureWarning(UserWarning):
 
 
 class TimeFeature(NamedTuple):
-    """A short interval in which functions of time change a lot; both ends are the same time if they jump there."""
+    """A short interval in which functions of time change a lot, or a time at which they jump (start = end)."""
 
     start: float
     end: float
@@ -53,40 +53,40 @@ class TimeFeature(NamedTuple):
         return self.start == self.end
 
 
-def schedule_around_features(
-    schedule: StepSchedule, systems: Sequence[System], states: Iterable, step: float | Adaptive
+def add_breaks_at_features_or_warn(
+    schedule: StepSchedule, systems: Sequence[System], initial_states: Iterable, step: float | Adaptive
 ) -> StepSchedule:
-    """Return a schedule in which no adaptive step jumps over a feature; steps of given size keep their ends.
+    """Return a schedule whose adaptive steps end at features, and warn if fixed steps skip a feature.
 
-    Jumps are breaks if they are all at the ends of steps, unless that changes which states are saved.
+    With fixed steps, jumps become breaks if all are at the ends of steps, unless that changes which states are saved.
 
     Parameters
     ----------
     schedule : StepSchedule
     systems : sequence of System
         Prepared systems, limited to the span of the schedule.
-    states : iterable of array, shape (n,)
-        Their initial states.
+    initial_states : iterable of array, shape (n,)
+        The initial states of these systems.
     step : float or Adaptive
-        With steps of given size there is a warning if a feature is shorter than a step.
     """
     features = [
         feature
-        for system, x in zip(systems, states, strict=True)
-        for feature in undeclared_features(system, x, schedule)
+        for system, x in zip(systems, initial_states, strict=True)
+        for feature in find_undeclared_features(system, x, schedule)
     ]
     if isinstance(step, Adaptive):
         edges = {t for feature in features for t in feature if schedule.start < t < schedule.end}
         return schedule.with_more_breaks(sorted(edges))
     jumps = sorted({feature.start for feature in features if feature.is_jump})
-    if schedule.save_every in (None, 1) and all(schedule.ends_step_at(t) for t in jumps):
+    if schedule.save_every in (None, 1) and all(schedule.has_step_end_at(t) for t in jumps):
         schedule, features = schedule.with_more_breaks(jumps), [f for f in features if not f.is_jump]
     warn_of_skipped_features(features, schedule.h)
     return schedule
 
 
-def undeclared_features(system: System, x: np.ndarray, schedule: StepSchedule) -> list[TimeFeature]:
-    """Return the features of the energy and the torque of a prepared system that are not at declared breaks.
+def find_undeclared_features(system: System, initial_state: np.ndarray, schedule: StepSchedule) -> list[TimeFeature]:
+    """Return the short intervals and times in which energy or torque of a prepared system change without a declared
+    break.
 
     The gradient of the energy and the torque at the initial state are compared at times all over the span. The time
     of a jump is found up to its rounding error.
@@ -95,7 +95,7 @@ def undeclared_features(system: System, x: np.ndarray, schedule: StepSchedule) -
     ----------
     system : System
         A prepared system.
-    x : array, shape (n,)
+    initial_state : array, shape (n,)
         Initial state.
     schedule : StepSchedule
     """
@@ -103,7 +103,7 @@ def undeclared_features(system: System, x: np.ndarray, schedule: StepSchedule) -
     if not np.isfinite(schedule.end) or n_intervals < MIN_SAMPLED_INTERVALS:
         return []
     times = np.linspace(schedule.start, schedule.end, n_intervals + 1)
-    values = _gradient_and_torque_of_state_at_times(system, x, times)
+    values = _gradient_and_torque_of_state_at_times(system, initial_state, times)
     if not np.isfinite(values).all():
         return []
     scale = np.ptp(values, axis=0)
@@ -117,21 +117,21 @@ def undeclared_features(system: System, x: np.ndarray, schedule: StepSchedule) -
     if len(groups) > MAX_FEATURES:
         return []
     features = []
-    for first, last in groups:
-        steepest = first + int(np.argmax(change[first:last]))
-        jump = _locate_jump(system, x, scale, times[steepest], times[steepest + 1], change[steepest])
+    for first_interval, end_interval in groups:
+        steepest = first_interval + int(np.argmax(change[first_interval:end_interval]))
+        jump = _locate_jump(system, initial_state, scale, times[steepest], times[steepest + 1], change[steepest])
         features += [] if jump is None else [TimeFeature(jump, jump)]
-        if jump is None or last - first > 1:
-            features.append(TimeFeature(float(times[first]), float(times[last])))
+        if jump is None or end_interval - first_interval > 1:
+            features.append(TimeFeature(float(times[first_interval]), float(times[end_interval])))
     return features
 
 
 def _gradient_and_torque_of_state_at_times(system: System, x: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Return the gradient of the energy and the torque at a state at several times, shape (times, values)."""
+    """Return the energy gradient and the torque at one state and several times, shape (times, values)."""
     assert system.clock is not None
     states = np.tile(np.asarray(x, dtype=np.float64), (len(times), 1))
     states[:, system.clock.index] = times * system.clock.unit
-    return np.asarray(evaluate_at_points(_time_dependent_values, system, states))
+    return np.asarray(evaluate_at_points(_energy_gradient_and_torque, system, states))
 
 
 def _locate_jump(system: System, x: np.ndarray, scale: np.ndarray, start: float, end: float, change: float):
@@ -140,16 +140,16 @@ def _locate_jump(system: System, x: np.ndarray, scale: np.ndarray, start: float,
         times = np.unique(np.linspace(start, end, N_PARTS + 1))
         values = _gradient_and_torque_of_state_at_times(system, x, times)
         changes = (np.abs(np.diff(values, axis=0)) / scale).max(axis=1)
-        part = int(np.argmax(changes))
-        if not changes[part] > JUMP_FRACTION * change:
+        steepest_part = int(np.argmax(changes))
+        if not changes[steepest_part] > JUMP_FRACTION * change:
             return None
         if len(times) <= N_PARTS:  # the parts are as short as the rounding of the times
-            return float(times[part + 1])
-        start, end = times[part], times[part + 1]
+            return float(times[steepest_part + 1])
+        start, end = times[steepest_part], times[steepest_part + 1]
 
 
-def _time_dependent_values(system: System, x) -> jax.Array:
-    """Return the gradient of the energy by the state of the body, and the torque."""
+def _energy_gradient_and_torque(system: System, x) -> jax.Array:
+    """Return the gradient of the energy by the state of the body, and the torque if there is one, in one array."""
     body, y = system.solved_subsystem(x)
     gradient = body.energy.gradient(y)[:-2]
     torque = body.external_torque(y)
@@ -157,17 +157,17 @@ def _time_dependent_values(system: System, x) -> jax.Array:
 
 
 def warn_of_skipped_features(features: Sequence[TimeFeature], h: float) -> None:
-    """Warn of features that are shorter than a step of size h."""
+    """Warn of jumps, or else of features that are shorter than a step of size h."""
     jumps = sorted({feature.start for feature in features if feature.is_jump})
-    short = sorted(feature for feature in features if not feature.is_jump and feature.end - feature.start < h)
+    short_features = sorted(feature for feature in features if not feature.is_jump and feature.end - feature.start < h)
     if jumps:
         breaks = ", ".join(f"{t:.17g}" for t in jumps[:8]) + (", ..." if len(jumps) > 8 else "")
         warn(
             f"the energy or the torque jumps inside of steps. Let steps end there: breaks=[{breaks}]",
             UndeclaredFeatureWarning,
         )
-    elif short:
-        start, end = short[0]
+    elif short_features:
+        start, end = short_features[0]
         warn(
             f"the energy or the torque changes a lot between t = {start:g} and t = {end:g}, within a step of {h:g}. "
             "Take shorter steps, or lt.Adaptive",

@@ -157,7 +157,9 @@ def _program_digest(solver: PointSolver) -> str:
         family = study_systems.family.with_builder_arrays([np.zeros(2) for _ in task.parameter_names])
         shapes = [jax.ShapeDtypeStruct(np.shape(value)[1:], np.float64) for value in family.parameter_arrays]
         jaxprs.append(
-            jax.make_jaxpr(lambda arrays, x: energy_and_vector_field(family.form.rebuild(arrays), x))(shapes, x)
+            jax.make_jaxpr(lambda arrays, x: energy_and_vector_field(family.program_structure.rebuild(arrays), x))(
+                shapes, x
+            )
         )
         constants = family.parameter_arrays[family.n_builder_arrays :]
     if callable(task.until):

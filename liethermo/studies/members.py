@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..functions.conditions import collect_conditions, condition_message
-from ..runs.named_parameters import find_parameter, lookup_parameter, named_parameters, replace_parameters
+from ..runs.named_parameters import find_parameter_or_none, named_parameters, replace_parameters, require_parameter
 from ..runs.system_family import Family
 from ..systems import System
 from ..systems.kind_checks import require_system
@@ -98,7 +98,7 @@ def _parameter_name_and_index(system: System, entry_name: str) -> tuple[str, tup
     assert indices is not None
     index_starts = [indices.start() + match.start() for match in re.finditer(r"\[", indices[0])]
     for end in (*index_starts, len(entry_name)):  # the name itself may end with an index, such as parts[0]
-        parameter = lookup_parameter(system, entry_name[:end])
+        parameter = find_parameter_or_none(system, entry_name[:end])
         index = tuple(map(int, re.findall(r"\d+", entry_name[end:])))
         shape = () if parameter is None else parameter.value.shape
         if parameter is not None and len(index) == len(shape) and all(map(int.__lt__, index, shape)):
@@ -117,7 +117,7 @@ def _replace_parameter_entries(
     """
     values: dict[str, Any] = {}
     for axis_name, (name, index) in entries.items():
-        value = values[name] if name in values else jnp.asarray(find_parameter(system, name).value)
+        value = values[name] if name in values else jnp.asarray(require_parameter(system, name).value)
         values[name] = value.at[index].set(point[axis_name])
     return replace_parameters(system, values)
 

@@ -1,6 +1,6 @@
 """Systems: an energy, an entropy, a Poisson structure and a dissipation, with their laws and their axioms checked."""
 
-from .attitude import MOMENTUM_LESS_IMPULSE, SPATIAL_MOMENTUM, AttitudeSystem, TurningSystem, momentum_system_of
+from .attitude import MOMENTUM_LESS_IMPULSE, SPATIAL_MOMENTUM, AttitudeChartSystem, AttitudeSystem, momentum_system_of
 from .base import System
 from .baths import HeatBaths
 from .composed.bodies import Copies, Membrane, Reaction, Subsystem
@@ -23,6 +23,7 @@ from .spins import SpinSystem
 __all__ = [
     "MOMENTUM_LESS_IMPULSE",
     "SPATIAL_MOMENTUM",
+    "AttitudeChartSystem",
     "AttitudeSystem",
     "ChartSystem",
     "ChetaevSystem",
@@ -53,7 +54,6 @@ __all__ = [
     "Subsystem",
     "System",
     "ThermodynamicHerglotz",
-    "TurningSystem",
     "embed_in_arrays",
     "equilibria",
     "linearise",

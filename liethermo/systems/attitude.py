@@ -23,11 +23,11 @@ from .base import System
 from .clock import Clock
 from .driven import DrivenSystem
 from .interface import EngineHints, WrappedSystem
-from .kind_checks import require_kind, user_system
+from .kind_checks import require_kind, unwrap_user_system
 from .lie_poisson import LiePoissonSystem
 from .lifted import LiftedSystem
 from .rotations import attitude_array
-from .transport import is_torque_free
+from .transport import moves_by_transport_alone
 
 SPATIAL_MOMENTUM = "momentum in space"
 """Name of the constant of the motion ``Ad_star(inverse(g), mu)``."""
@@ -73,19 +73,19 @@ class AttitudeSystem(LiftedSystem):
         self.preserved_labels, self.invariant_verdicts = body.preserved_labels, body.invariant_verdicts
 
     @property
-    def hints(self) -> EngineHints:
+    def engine_hints(self) -> EngineHints:
         series_maps = {"exp": maps.exp, "coadjoint": maps.adjoint_cayley}
         group_maps = {"exp": self.group.exp_map, "coadjoint": self.group.adjoint_cayley_map}
         kind = self.reconstruction
         has_closed_form = kind not in group_maps or group_maps[kind] is not series_maps[kind]
-        hints = super().hints
-        return hints._replace(
-            can_unroll=hints.can_unroll and self.attitude_layout.n_real_parts == 1 and has_closed_form
+        engine_hints = super().engine_hints
+        return engine_hints._replace(
+            can_unroll=engine_hints.can_unroll and self.attitude_layout.n_reals_per_entry == 1 and has_closed_form
         )
 
     @property
     def momentum_system(self) -> LiePoissonSystem:
-        """System of mu and the baths, without attitude and clock."""
+        """The Lie-Poisson system of the momentum mu and the baths, without attitude and clock."""
         return momentum_system_of(self.body)
 
     @property
@@ -99,17 +99,17 @@ class AttitudeSystem(LiftedSystem):
     @property
     def clock(self) -> Clock | None:
         clock = self.body.clock
-        return clock and replace_fields(clock, n_last_counters=self.impulse_dim)
+        return clock and replace_fields(clock, n_trailing_counters=self.impulse_dim)
 
     def body_at_attitude(self, x) -> LiePoissonSystem | DrivenSystem:
         """Return the body with its torque bound to the attitude of a state."""
-        return self.body.bind_attitude(self.attitude_layout.split(x)[1])
+        return self.body.bind_attitude(self.attitude_layout.split_state(x)[1])
 
     def solved_subsystem(self, x) -> tuple[System, jax.Array]:
-        return self.body_at_attitude(x), self.points(x)
+        return self.body_at_attitude(x), self.body_states(x)
 
-    def spatial_action(self, g) -> jax.Array:
-        """Return the matrix A, shape (..., n, n), for which ``mu @ A`` is the momentum in space."""
+    def momentum_to_space_matrix(self, g) -> jax.Array:
+        """Return the matrix A, shape (..., n, n), that maps a body momentum to space, ``mu @ A``, at the attitude g."""
         return self.group.Ad(self.group.inverse_map(g))
 
     def initial_state(self, mu, t: float = 0.0, attitude=None, batch: bool = False) -> jax.Array:
@@ -135,34 +135,38 @@ class AttitudeSystem(LiftedSystem):
             raise InputError(f"a run has one attitude, of shape {self.group.identity.shape}, got {g.shape}")
         mu, g = jnp.broadcast_to(mu, (*batch_shape, mu.shape[-1])), jnp.broadcast_to(g, (*batch_shape, *g.shape[-2:]))
         if not self.impulse_dim:
-            return self.attitude_layout.join(mu, g)
-        return self.attitude_layout.join(
-            mu, g, jnp.einsum("...a,...ab->...b", mu[..., : self.group.dim], self.spatial_action(g))
+            return self.attitude_layout.join_state(mu, g)
+        return self.attitude_layout.join_state(
+            mu, g, jnp.einsum("...a,...ab->...b", mu[..., : self.group.dim], self.momentum_to_space_matrix(g))
         )
 
-    def points(self, x):
-        """Return the state of the body, on which energy, entropy and Casimirs depend."""
+    def body_states(self, x) -> jax.Array:
+        """Return the states of the body, shape (..., body.dim), from states with an attitude, shape (..., n)."""
         return x[..., : self.body.dim]
 
-    def user_state(self, x):
-        return self.body.user_state(self.points(x))
+    def points(self, x):
+        """Return the states of the body, of which energy, entropy and Casimirs are functions."""
+        return self.body_states(x)
 
-    def component_scales(self, k):
-        """Return scales of momenta, which have a unit, and of attitudes, which have none."""
+    def user_state(self, x):
+        return self.body.user_state(self.body_states(x))
+
+    def slope_scales(self, slopes):
+        """Return the scale of each component of slopes, shape (..., n), separate for momenta and for attitudes."""
         n, m = self.body.dim, self.dim - self.impulse_dim
-        scales = [self.body.component_scales(k[..., :n]), super().component_scales(k[..., n:m])]
+        scales = [self.body.slope_scales(slopes[..., :n]), super().slope_scales(slopes[..., n:m])]
         if m < self.dim:
-            scales.append(super().component_scales(k[..., m:]))
+            scales.append(super().slope_scales(slopes[..., m:]))
         return jnp.concatenate(scales, axis=-1)
 
     def to_user_solution(self, solution):
-        states, g = self.attitude_layout.split(solution.x)
+        states, g = self.attitude_layout.split_state(solution.x)
         stats = dataclasses.replace(
             solution.stats,
             attitude_residual=self.max_attitude_residual(solution.x),
             spatial_momentum_change=self.max_spatial_momentum_change(solution.x),
         )
-        dense = None if solution.dense is None else solution.dense.with_output_map(self.points)
+        dense = None if solution.dense is None else solution.dense.with_output_map(self.body_states)
         series = {name: f - f[0] if name in self.impulse_names else f for name, f in solution.casimirs.items()}
         body_solution = dataclasses.replace(solution, x=np.asarray(states), dense=dense, stats=stats, casimirs=series)
         body_solution = self.body.to_user_solution(body_solution)
@@ -172,24 +176,24 @@ class AttitudeSystem(LiftedSystem):
             x0=body_solution.x[0].tolist(),
         )
 
-    def max_attitude_residual(self, x) -> float:
-        """Return the largest relative distance from the group of the attitudes of states, shape (m, n)."""
-        return float(np.max(_evaluate_at_states(_attitude_residual, self, x)))
+    def max_attitude_residual(self, states) -> float:
+        """Return the largest relative distance between the attitudes of states, shape (m, n), and the group."""
+        return float(np.max(_evaluate_at_states(_attitude_residual, self, states)))
 
-    def max_spatial_momentum_change(self, x) -> float:
-        """Return the largest change of the spatial momentum minus impulse, from the first of the states, shape (m, n).
+    def max_spatial_momentum_change(self, states) -> float:
+        """Return the largest relative change of the spatial momentum minus impulse among states, shape (m, n).
 
         The change is relative to the largest term that is added up in a component.
         """
-        momenta, scales = _evaluate_at_states(_spatial_momentum_and_scale, self, x)
+        momenta, scales = _evaluate_at_states(_spatial_momentum_and_scale, self, states)
         scale = float(np.max(scales))
         return float(np.abs(momenta - momenta[0]).max()) / (scale if scale > 0.0 else 1.0)
 
     inertia = forward_to("momentum_system")
 
     @property
-    def constant_names(self):
-        if not is_torque_free(self.body):
+    def vector_invariant_names(self):
+        if not moves_by_transport_alone(self.body):
             return ()
         return (MOMENTUM_LESS_IMPULSE,) if self.impulse_dim else (SPATIAL_MOMENTUM,)
 
@@ -213,53 +217,51 @@ class AttitudeSystem(LiftedSystem):
     @property
     def state_blocks(self):
         n, m = self.body.dim, self.dim - self.impulse_dim
-        return *_body_blocks(self.body), slice(n, m), *([slice(m, None)] if m < self.dim else [])
-
-    @property
-    def inner(self) -> System:
-        return self.body
+        return *_body_block_slices(self.body), slice(n, m), *([slice(m, None)] if m < self.dim else [])
 
     def attitude_velocity(self, x) -> jax.Array:
         """Return the velocity xi of the attitude at a state, ``g' = g hat(xi)``, shape (group.dim,)."""
-        mu, body = self.points(x), self.body_at_attitude(x)
+        mu, body = self.body_states(x), self.body_at_attitude(x)
         dS = body.entropy_gradient(mu)
-        xi = body.transport(mu, body.energy.gradient(mu), dS, tuple(L.gradient(mu) for L in body.preserved))
+        xi = body.transport_covector(
+            mu, body.energy.gradient(mu), dS, tuple(L.gradient(mu) for L in body.preserved_functions)
+        )
         return xi[: self.group.dim]
 
     def _vector_field(self, x):
-        (mu, g), body = self.attitude_layout.split(x), self.body_at_attitude(x)
-        p = body.external_torque(mu)[: self.group.dim] @ self.spatial_action(g) if self.impulse_dim else None
-        return self.attitude_layout.join(
+        (mu, g), body = self.attitude_layout.split_state(x), self.body_at_attitude(x)
+        p = body.external_torque(mu)[: self.group.dim] @ self.momentum_to_space_matrix(g) if self.impulse_dim else None
+        return self.attitude_layout.join_state(
             body._vector_field(mu), g @ self.group.algebra.hat(self.attitude_velocity(x)), p
         )
 
 
-def _body_blocks(body: System) -> list[slice]:
-    """Return the blocks of the state of a body as slices of a longer state that begins with it."""
+def _body_block_slices(body: System) -> list[slice]:
+    """Return the slices of a state that hold the blocks of its body, with which the state begins."""
     return [slice(*block.indices(body.dim)) for block in body.state_blocks]
 
 
-def _evaluate_at_states(function: Callable, system: AttitudeSystem, x):
-    """Return ``function(system, x)`` at states, shape (m, n)."""
+def _evaluate_at_states(function: Callable, system: AttitudeSystem, states):
+    """Return the values of ``function(system, x)`` at each state x, shape (m, n), with m as the first axis."""
     rows = np.minimum(
-        np.arange(1 << (len(x) - 1).bit_length()), len(x) - 1
+        np.arange(1 << (len(states) - 1).bit_length()), len(states) - 1
     )  # padded to a power of two, so that few programs are compiled
-    return evaluate_at_points(function, system, np.asarray(x)[rows])
+    return evaluate_at_points(function, system, np.asarray(states)[rows])
 
 
 def momentum_system_of(body: System) -> LiePoissonSystem:
-    """Return the Lie-Poisson system that a driven system contains, or the system itself."""
-    return require_kind(user_system(body), LiePoissonSystem, "an attitude")
+    """Return the user's Lie-Poisson system, without the clock of a driven system; InputError for other systems."""
+    return require_kind(unwrap_user_system(body), LiePoissonSystem, "an attitude")
 
 
 def _attitude_residual(system: AttitudeSystem, x) -> jax.Array:
-    return system.group.defect(system.attitude_layout.split(x)[1])
+    return system.group.defect(system.attitude_layout.split_state(x)[1])
 
 
 def _spatial_momentum_and_scale(system: AttitudeSystem, x) -> tuple[jax.Array, jax.Array]:
-    """Return the spatial momentum minus the impulse, and the largest term that is added up in a component of it."""
-    (state, g), p = system.attitude_layout.split(x), system.attitude_layout.impulse(x)
-    mu, action = state[: system.group.dim], system.spatial_action(g)
+    """Return the spatial momentum minus the impulse, and the size of the largest term in a component of it."""
+    (state, g), p = system.attitude_layout.split_state(x), system.attitude_layout.impulse(x)
+    mu, action = state[: system.group.dim], system.momentum_to_space_matrix(g)
     momentum = mu @ action
     scale = jnp.maximum(jnp.max(jnp.abs(mu) @ jnp.abs(action)), system.body.motion_quantities.momentum_scale(state))
     return momentum - p if system.impulse_dim else momentum, scale
@@ -270,8 +272,8 @@ ANGLE_UNIT = 2.0**-300
 which the momentum alone determines, be it 1e20 or 1e-20. It is a power of two, so that scaling rounds nothing."""
 
 
-class TurningSystem(LiftedSystem):
-    """A body in coordinates (mu, theta) around an attitude g, for the attitude ``g exp(hat(theta))``.
+class AttitudeChartSystem(LiftedSystem):
+    """A body in exponential coordinates (mu, theta) around a fixed attitude g; its attitude is ``g exp(hat(theta))``.
 
     ``theta' = dexp(theta)^-1 transport(mu)`` [Munthe-Kaas 1999]: a system on a vector space, for one step of a method
     that needs no more. The laws are those of mu. Theta is in units of
@@ -290,65 +292,66 @@ class TurningSystem(LiftedSystem):
     order: int = eqx.field(static=True)
     attitude: jax.Array
 
-    def __init__(self, attitude_system: AttitudeSystem, order: int, attitude: jax.Array):
+    def __init__(self, attitude_system: AttitudeSystem, series_order: int, attitude: jax.Array):
         body = attitude_system.body
-        self.attitude_system, self.order, self.attitude = attitude_system, order, attitude
+        self.attitude_system, self.order, self.attitude = attitude_system, series_order, attitude
         self.dim, self.space = body.dim + attitude_system.group.dim + attitude_system.impulse_dim, None
         self.poisson = mf.NoPoisson(self.dim)  # field() computes the motion
         self.energy, self.entropy = attitude_system.energy, attitude_system.entropy
         self._lift_laws()
 
     @property
-    def inner(self) -> LiePoissonSystem | DrivenSystem:
+    def inner_system(self) -> LiePoissonSystem | DrivenSystem:
         return self.attitude_system.body
 
     @property
     def state_blocks(self):
-        n, m = self.inner.dim, self.inner.dim + self.attitude_system.group.dim
-        return *_body_blocks(self.inner), slice(n, m), *([slice(m, None)] if m < self.dim else [])
+        n, m = self.inner_system.dim, self.inner_system.dim + self.attitude_system.group.dim
+        return *_body_block_slices(self.inner_system), slice(n, m), *([slice(m, None)] if m < self.dim else [])
 
     def pullback(self, energy: Energy) -> Energy:
         return self.extend(energy)
 
     def field(self, x, dH, dS, dL=()):
-        body, arguments = self.inner_at(x), self.inner_arguments(x, dH, dS, dL)
+        body, arguments = self.inner_system_at(x), self.restrict_to_inner_state(x, dH, dS, dL)
         algebra = self.attitude_system.group.algebra
-        velocity = body.transport(*arguments)[: algebra.dim]
-        angle_rates = maps.inverse_dexp(algebra, self.angles(x), velocity, self.order)
+        velocity = body.transport_covector(*arguments)[: algebra.dim]
+        angle_rates = maps.inverse_dexp(algebra, self.rotation_angles(x), velocity, self.order)
         rates = [body.field(*arguments), ANGLE_UNIT * angle_rates]
         if self.torque_laws.has_impulse:
             torque = body.external_torque(arguments[0])
             assert torque is not None
             rates.append(
-                ANGLE_UNIT * (torque[: algebra.dim] @ self.attitude_system.spatial_action(self._attitude_at(x)))
+                ANGLE_UNIT
+                * (torque[: algebra.dim] @ self.attitude_system.momentum_to_space_matrix(self._attitude_at(x)))
             )
         return jnp.concatenate(rates)
 
-    def inner_at(self, x) -> System:
-        body = self.inner
+    def inner_system_at(self, x) -> System:
+        body = self.inner_system
         return body.bind_attitude(self._attitude_at(x)) if body.torque_laws.needs_attitude else body
 
     def _attitude_at(self, x) -> jax.Array:
         group = self.attitude_system.group
-        return self.attitude @ group.exp_map(group.algebra, self.angles(x))
+        return self.attitude @ group.exp_map(group.algebra, self.rotation_angles(x))
 
     # -- coordinates --------------------------------------------------------------------------------------------------
 
-    def local_coordinates(self, x) -> jax.Array:
-        """Return the coordinates of a state of the attitude system around its attitude."""
+    def coordinates_of_state(self, x) -> jax.Array:
+        """Return the coordinates (mu, 0, impulse) of a state x at the centre of the chart, shape (dim,)."""
         return jnp.concatenate(
             [
-                self.attitude_system.points(x),
+                self.attitude_system.body_states(x),
                 jnp.zeros(self.attitude_system.group.dim),
                 ANGLE_UNIT * self.attitude_system.attitude_layout.impulse(x),
             ]
         )
 
-    def angles(self, v) -> jax.Array:
-        """Return theta of coordinates, shape (..., algebra.dim)."""
-        n = self.inner.dim
-        return v[..., n : n + self.attitude_system.group.dim] / ANGLE_UNIT
+    def rotation_angles(self, coordinates) -> jax.Array:
+        """Return the angles theta, shape (..., algebra.dim), from coordinates of the chart, shape (..., dim)."""
+        n = self.inner_system.dim
+        return coordinates[..., n : n + self.attitude_system.group.dim] / ANGLE_UNIT
 
-    def spatial_impulse(self, v) -> jax.Array:
-        """Return the spatial impulse of coordinates, shape (..., algebra.dim)."""
-        return v[..., self.inner.dim + self.attitude_system.group.dim :] / ANGLE_UNIT
+    def spatial_impulse(self, coordinates) -> jax.Array:
+        """Return the spatial impulse, shape (..., algebra.dim), from coordinates of the chart, shape (..., dim)."""
+        return coordinates[..., self.inner_system.dim + self.attitude_system.group.dim :] / ANGLE_UNIT

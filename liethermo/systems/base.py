@@ -29,7 +29,7 @@ from .baths import ABSENT_BATHS, BathEntropy, HeatBaths, checked_baths, poisson_
 from .check import AXIOM_TOLERANCE, CheckReport, check_system, require_axioms
 from .conservation import project_covector
 from .interface import SystemInterface
-from .invariants import find_invariants, find_preserved_names, named_functions
+from .invariants import candidate_invariants, find_invariants, find_preserved_function_names
 from .states import checked_state_array, evaluate_batch, reshape_to_sites
 from .transport import dissipation_velocities, generator_field, has_generator
 
@@ -87,7 +87,7 @@ class System(SystemInterface):
         baths=None,
         check_poisson: bool = True,
     ) -> None:
-        """Check and set the common attributes; constructors of subclasses call it after they have set their own.
+        """Check the arguments and set the attributes that all systems have; constructors call it last.
 
         Without ``check_poisson`` an expensive check is skipped, because Pi is a Poisson tensor by construction.
         """
@@ -95,17 +95,17 @@ class System(SystemInterface):
         self.dim, self.space = dim, space
         self.poisson = trace_callables(poisson, lambda poisson, x: poisson.sharp(x, x), (dim,))
         self.energy = checked_energy(
-            self.energy_of_vectors(make_energy(energy, "the energy")), dim, "the energy", allow_time=True
+            self.energy_of_flat_states(make_energy(energy, "the energy")), dim, "the energy", allow_time=True
         )
         self.entropy = None
         if entropy is not None:
             self.entropy = checked_energy(
-                self.energy_of_vectors(make_energy(entropy, "the entropy")), dim, "the entropy"
+                self.energy_of_flat_states(make_energy(entropy, "the entropy")), dim, "the entropy"
             )
         momentum_maps = name_momentum_maps(momentum_maps)
         roles = {name: f"momentum map {name!r}" for name in momentum_maps}
         self.momentum_maps = {
-            name: checked_energy(self.energy_of_vectors(make_energy(J, roles[name])), dim, roles[name])
+            name: checked_energy(self.energy_of_flat_states(make_energy(J, roles[name])), dim, roles[name])
             for name, J in momentum_maps.items()
         }
         if space is None:  # in a chart no function is quadratic
@@ -137,10 +137,10 @@ class System(SystemInterface):
             self.dissipation = _bind_dissipation(self, dissipation)
         if baths.number:
             _attach_baths(self, baths, bath_terms)
-        if self.preserved and not is_traced(self):
-            self.preserved_labels = find_preserved_names(self)
+        if self.preserved_functions and not is_traced(self):
+            self.preserved_labels = find_preserved_function_names(self)
         if validate and not is_traced(self):
-            require_axioms(self, matrices=check_poisson)
+            require_axioms(self, with_matrices=check_poisson)
 
     def drop_baths(self) -> System:
         if not self.baths.number:
@@ -205,12 +205,12 @@ class System(SystemInterface):
             )
         return T[..., 0]
 
-    def energy_of_vectors(self, energy: Energy) -> Energy:
-        """Return a function of flat states from a function of states in the shape that users see."""
+    def energy_of_flat_states(self, energy: Energy) -> Energy:
+        """Return an energy of flat states, shape (n,), from one of states in the shape that users see."""
         return energy_of_vectors(functions_of_flat_states(energy, self.shape), self.space)
 
     def _trace_dissipation(self, dissipation: Dissipation) -> Dissipation:
-        """Return the dissipation with its plain functions traced for the arguments that its force passes to them."""
+        """Return the dissipation with its Python functions traced by JAX at states of this system."""
 
         def force(dissipation, x):
             return dissipation.force(self, x, x, x, (x,) * len(dissipation.preserve))
@@ -220,7 +220,7 @@ class System(SystemInterface):
     # -- dynamics -------------------------------------------------------------------------------------------------
 
     def vector_field(self, x, t=None) -> jax.Array:
-        """Return ``x'`` at states x, shape (..., n), and at the time t if the energy depends on it."""
+        """Return the vector field ``x'``, shape (..., n), at states x and, if the energy depends on it, the time t."""
         return evaluate_batch(self, _field_at, x, t, "(n)")
 
     def entropy_production(self, x, t=None) -> jax.Array:
@@ -244,8 +244,8 @@ class System(SystemInterface):
         dH, dL = system.energy.gradient(x), tuple(L.gradient(x) for L in dissipation.preserve)
         return jax.jacfwd(lambda dS: dissipation.force(system, x, dH, dS, dL))(jnp.zeros(self.dim))
 
-    def transport(self, x, dH, dS, dL=()) -> jax.Array:
-        """Return the covector that transports the state, ``x' = Pi(x) transport`` without torques.
+    def transport_covector(self, x, dH, dS, dL=()) -> jax.Array:
+        """Return the covector, shape (body_dim,), that Pi maps to the velocity of the body without torques.
 
         It is dH plus the velocities of the dissipations [:meth:`liethermo.Dissipation.velocity`], for the body without
         baths; the gradients are continuous or discrete. On a Lie algebra an attitude follows it:
@@ -259,32 +259,32 @@ class System(SystemInterface):
     # -- other forms of the same system -------------------------------------------------------------------------------
 
     def local_system(self, x, is_centred: bool = False) -> tuple[System, jax.Array]:
-        """Return this system in local coordinates near a state, and the coordinates of that state.
+        """Return this system in local coordinates near a state x, and the coordinates of x in it.
 
         With ``is_centred`` the local system is for use at that state alone.
         """
         return self, x
 
     def solved_subsystem(self, x) -> tuple[System, jax.Array]:
-        """Return the sub-system and the part of a state that the equations of a step are solved for.
+        """Return the subsystem whose equations a step solves, and its part of the state x; the rest follows from it.
 
         Slopes and errors have its dimension. The other components follow from it, and have tolerances of their own.
         """
         return self, x
 
     def to_user_solution(self, solution: Any) -> Any:
-        """Return a solution in the form that the user sees."""
+        """Return a solution with states in the shape that the user sees, from one of the system that was run."""
         return reshape_to_sites(self, solution)
 
-    def freeze_at(self, x) -> System:
-        """Return the system for use at one state, with the common parts of Pi and K computed once."""
+    def cache_tensors_at(self, x) -> System:
+        """Return the system for use at the state x only, with parts that Pi and K share computed once."""
         return self
 
     # -- functions and laws -------------------------------------------------------------------------------------------
 
     def functions(self) -> dict[str, Energy]:
         """Return momentum maps, functions that the dissipation preserves, and Casimirs, by name, each quantity once."""
-        return named_functions(self)
+        return candidate_invariants(self)
 
     @with_library_settings
     def first_integrals(self) -> frozenset[str]:
@@ -300,7 +300,7 @@ class System(SystemInterface):
     # -- checks ---------------------------------------------------------------------------------------------------
 
     def state(self, x, batch: bool = False) -> jax.Array:
-        """Return ``x`` as a state of this system: real doubles, finite, shape (n,), or (..., n) with ``batch``.
+        """Return ``x`` as a checked state: real doubles, finite, shape (n,), or (..., n) with ``batch``.
 
         For a system on sites x may have the shape ``(*sites, d)``. On a manifold x may have the shape of points,
         and must be a point of it.
@@ -313,7 +313,7 @@ class System(SystemInterface):
         return numbers.astype(jnp.float64) if isinstance(numbers, jax.core.Tracer) else real_array(numbers)
 
     def state_array(self, x, batch: bool = False) -> np.ndarray | jax.Array:
-        """Return the state x as :meth:`state` does, as an array of NumPy unless JAX traces it."""
+        """Return ``x`` as a checked state, as :meth:`state` does, but as a NumPy array unless JAX traces it."""
         return checked_state_array(self, x, batch)
 
     @with_library_settings
@@ -340,19 +340,19 @@ class System(SystemInterface):
         if has_generator(self):
             return generator_field(self, x)
         dS = jnp.zeros_like(x) if self.entropy is None else self.entropy.gradient(x)
-        gradients = self.energy.gradient(x), dS, *(L.gradient(x) for L in self.preserved)
+        gradients = self.energy.gradient(x), dS, *(L.gradient(x) for L in self.preserved_functions)
         dH, dS, *dL = (project_covector(self, x, alpha) for alpha in gradients)
         return self.field(x, dH, dS, tuple(dL))
 
 
 def _bind_dissipation(system: System, dissipation: Dissipation) -> Dissipation:
-    """Return the dissipation bound to the system, its functions traced."""
+    """Return the dissipation bound to the system, with its Python functions traced by JAX."""
     dissipation = trace_energies(dissipation, system.dim, "a preserved function")
     return system._trace_dissipation(dissipation.bind_to(system))
 
 
 def _attach_baths(system: System, baths: HeatBaths, bath_terms: tuple[Dissipation, ...]) -> None:
-    """Append baths to the system, in place; the dissipations ``bath_terms`` act on the extended states."""
+    """Append baths to a system in place; the dissipations ``bath_terms`` act on the extended states."""
     body, n, m = copy(system), system.dim, baths.number
 
     def extend(energy: Energy) -> Energy:
@@ -375,36 +375,39 @@ def _attach_baths(system: System, baths: HeatBaths, bath_terms: tuple[Dissipatio
 
 
 def _field_at(system: System, x) -> jax.Array:
+    """Return the vector field at one state, shape (n,)."""
     return system._vector_field(x)
 
 
 def _entropy_production_at(system: System, x) -> jax.Array:
+    """Return the growth rate of the entropy at one state, shape ()."""
     assert system.entropy is not None
     return jnp.dot(system.entropy.gradient(x), system._vector_field(x))
 
 
 def _energy_fall_at(system: System, x) -> jax.Array:
+    """Return the rate at which the dissipation lowers the energy at one state, shape ()."""
     if system.dissipation is None:
         return jnp.zeros(())
     dH, dS = system.energy.gradient(x), system.entropy_gradient(x)
-    dL = tuple(L.gradient(x) for L in system.preserved)
+    dL = tuple(L.gradient(x) for L in system.preserved_functions)
     return -system.dissipation.rate_of_change(system, x, dH, dS, dL, dH)
 
 
 def _drop_last_factor(space: mf.Space) -> mf.Space:
     """Return a product space without its last factor."""
     assert isinstance(space, mf.Product)
-    first, *others = space.factors[:-1]
-    return mf.Product(first, *others) if others else first
+    first_factor, *other_factors = space.factors[:-1]
+    return mf.Product(first_factor, *other_factors) if other_factors else first_factor
 
 
-def name_momentum_maps(given) -> dict[str, Any]:
-    """Return momentum maps by name, from a mapping or a sequence of functions."""
-    if isinstance(given, Mapping):
-        return dict(given)
-    if not isinstance(given, Sequence) or isinstance(given, str):
-        raise InputError(f"momentum_maps must be a dict or a sequence of functions, got {type(given).__name__}")
-    return {callable_name(J, f"J{i + 1}"): J for i, J in enumerate(given)}
+def name_momentum_maps(momentum_maps) -> dict[str, Any]:
+    """Return momentum maps as a dict by name, from a mapping or from a sequence of functions."""
+    if isinstance(momentum_maps, Mapping):
+        return dict(momentum_maps)
+    if not isinstance(momentum_maps, Sequence) or isinstance(momentum_maps, str):
+        raise InputError(f"momentum_maps must be a dict or a sequence of functions, got {type(momentum_maps).__name__}")
+    return {callable_name(J, f"J{i + 1}"): J for i, J in enumerate(momentum_maps)}
 
 
 __all__ = ["AXIOM_TOLERANCE", "System", "name_momentum_maps"]

@@ -17,6 +17,8 @@ from manifolds.structures.poisson import ProductPoisson
 
 from ..errors import InputError
 from ..functions.bath_energy import (
+    BATH_CAPACITY_CONDITION,
+    BATH_TEMPERATURE_CONDITION,
     BathEnergy,
     DrivenReservoirEnergy,
     ReservoirEnergy,
@@ -25,14 +27,14 @@ from ..functions.bath_energy import (
     make_bath_energy,
 )
 from ..functions.checks import traced_function_and_shape
-from ..functions.conditions import checked_numbers
+from ..functions.conditions import Condition, checked_numbers
 from ..functions.energy import Energy, Sum
 from ..functions.mechanics import Each
 from ..tracing.short_form import format_arguments
 
 
 class HeatBaths(Module):
-    """Baths, each with an energy that is a function of its own entropy y: by default ``U = C T (exp(y / C) - 1)``.
+    """Heat baths, each with an energy that is a function of its own entropy y: by default ``U = C T (exp(y / C) - 1)``.
 
     This default has the constant heat capacity C, and the temperature T at y = 0. A system with baths has the state
     (x, y), the energy ``H(x) + U(y)``, and an entropy that includes ``sum y``. A dissipation that lowers the energy of
@@ -97,19 +99,19 @@ class HeatBaths(Module):
         if callable(energy):
             self.energy = Each(_BathEnergyFunction(energy), np.arange(number)[:, None])
             return
-        functions = _entries_of_baths(energy, "energy", number) if energy is not None else [None] * number
-        temperatures = _entries_of_baths(temperature, "temperature", number)
+        functions = _entry_per_bath(energy, "energy", number) if energy is not None else [None] * number
+        temperatures = _entry_per_bath(temperature, "temperature", number)
         driven = [i for i, T in enumerate(temperatures) if callable(T) and functions[i] is None]
         if not driven and all(function is None for function in functions):
-            parameters = {"capacity": capacity, "temperature": temperature}
             self.energy = make_bath_energy(
-                *(_check_positive(value, what, number, what == "capacity") for what, value in parameters.items())
+                _checked_positive_array(capacity, "capacity", number, BATH_CAPACITY_CONDITION),
+                _checked_positive_array(temperature, "temperature", number, BATH_TEMPERATURE_CONDITION),
             )
             return
         numbers = [1.0 if callable(T) else T for T in temperatures]
         C, T = (
-            _check_positive(capacity, "capacity", number, True),
-            _check_positive(numbers, "temperature", number, False),
+            _checked_positive_array(capacity, "capacity", number, BATH_CAPACITY_CONDITION),
+            _checked_positive_array(numbers, "temperature", number, BATH_TEMPERATURE_CONDITION),
         )
         for i in driven:
             if not is_traced(C) and np.isfinite(C[i]):
@@ -135,22 +137,22 @@ class HeatBaths(Module):
         )
 
     @property
-    def scale(self) -> np.ndarray | float:
-        """Scale of the entropy of each bath, shape (number,): its heat capacity, or 1 if that is infinite.
+    def constant_entropy_scales(self) -> np.ndarray | float:
+        """Scale of the entropy of each bath as a NumPy array, shape (number,); the number 1 if the energy is traced.
 
-        All are 1 if a temperature or an energy is a function. The result is the number 1 if the energy is traced.
+        It is :meth:`entropy_scales`, for code outside of JAX; all are 1 if a temperature or an energy is a function.
         """
         return 1.0 if is_traced(self.energy) else np.asarray(self.entropy_scales())
 
     def entropy_scales(self) -> jax.Array:
-        """Return the scale of the entropy of each bath, as an array that JAX can trace, shape (number,)."""
+        """Return the scale of the entropy of each bath, shape (number,): its capacity, or 1 if that is infinite."""
         if not isinstance(self.energy, BathEnergy):  # none has a capacity, or one is given by a function
             return jnp.ones(self.number)
         return jnp.where(jnp.isfinite(self.energy.capacity), self.energy.capacity, 1.0)
 
 
 class _AbsentBaths(HeatBaths):
-    """Baths of number zero, of a system without baths."""
+    """Zero baths, which a system without baths has."""
 
     def __init__(self):
         self.energy, self.number = ZeroEnergy(), 0
@@ -161,7 +163,7 @@ ABSENT_BATHS = _AbsentBaths()
 
 
 def checked_baths(baths: HeatBaths | None) -> HeatBaths:
-    """Return the baths that a user gave to a system; without any, baths of number zero.
+    """Return the baths that a user gave, after a check of their type; :data:`ABSENT_BATHS` for None.
 
     Raises
     ------
@@ -172,20 +174,20 @@ def checked_baths(baths: HeatBaths | None) -> HeatBaths:
     return ABSENT_BATHS if baths is None else baths
 
 
-def _entries_of_baths(value, what: str, number: int) -> list:
-    """Return an entry for each bath, from one for all or a sequence; a function to an array has an entry for each."""
+def _entry_per_bath(value, what: str, n_baths: int) -> list:
+    """Return a list with one entry per bath, from one value or function for all baths, or from a sequence."""
     if callable(value):
-        shape = np.shape(value(0.0)) if number > 1 else ()
-        return [value] * number if shape != (number,) else [_EntryOfFunction(value, i) for i in range(number)]
+        shape = np.shape(value(0.0)) if n_baths > 1 else ()
+        return [value] * n_baths if shape != (n_baths,) else [_EntryOfFunction(value, i) for i in range(n_baths)]
     if not isinstance(value, list | tuple):
-        return [value] * number if np.ndim(value) == 0 else list(value)
-    if len(value) != number:
-        raise InputError(f"the {what} of {number} baths must have one entry per bath, got {len(value)}")
+        return [value] * n_baths if np.ndim(value) == 0 else list(value)
+    if len(value) != n_baths:
+        raise InputError(f"the {what} of {n_baths} baths must have one entry per bath, got {len(value)}")
     return list(value)
 
 
 class _EntryOfFunction(Module):
-    """One entry of a function of the time to an array."""
+    """One entry of an array-valued function of time, as a function of time."""
 
     function: Callable
     index: int = eqx.field(static=True)
@@ -195,13 +197,14 @@ class _EntryOfFunction(Module):
 
 
 def _checked_temperature_function(function: Callable, index: int) -> Callable:
+    """Return a checked function of time whose value is the temperature of a bath; NaN where it is not positive."""
     what = f"the temperature of bath {index}"
     traced, _ = traced_function_and_shape(function, ((),), [()], what, "a time")
     return _PositiveTemperature(traced)
 
 
 class _PositiveTemperature(Module):
-    """A temperature as a function of time; NaN where it is not positive, so that a step is rejected."""
+    """A temperature as a function of time, NaN where it is not positive, so that a step is rejected."""
 
     function: Callable
 
@@ -210,34 +213,37 @@ class _PositiveTemperature(Module):
         return jnp.where(T > 0.0, T, jnp.nan)
 
 
-def _check_positive(value, what: str, number: int, infinite: bool) -> jax.Array:
+def _checked_positive_array(value, what: str, n_baths: int, condition: Condition) -> jax.Array:
     # numbers stay numbers while JAX traces a family of systems
+    """Return one positive number per bath as an array, shape (n_baths,); InputError for other values."""
     evaluation = contextlib.nullcontext() if is_traced(value) else jax.ensure_compile_time_eval()
     with evaluation:
         array = checked_numbers(value, f"the {what} of baths")
-        array = jnp.broadcast_to(array, (number,)) if array.ndim == 0 else array
-    if array.shape != (number,):
-        raise InputError(f"the {what} of {number} baths must be a number or have shape ({number},), got {array.shape}")
-    if not is_traced(array) and not all(a > 0.0 and (infinite or np.isfinite(a)) for a in array.tolist()):
-        allowed = "positive" if infinite else "positive and finite"
-        raise InputError(f"the {what} of a bath must be {allowed}, got {array.tolist()}")
+        array = jnp.broadcast_to(array, (n_baths,)) if array.ndim == 0 else array
+    if array.shape != (n_baths,):
+        raise InputError(
+            f"the {what} of {n_baths} baths must be a number or have shape ({n_baths},), got {array.shape}"
+        )
+    condition.require(array)
     return array
 
 
 class _BathEnergyFunction(Module):
+    """The energy of one bath as a function of its entropy in an array, shape (1,)."""
+
     energy: Callable
 
     def __call__(self, y):
         return self.energy(y[0])
 
 
-def poisson_with_baths(body: mf.PoissonStructure, number: int) -> mf.PoissonStructure:
+def poisson_with_baths(body_poisson: mf.PoissonStructure, n_baths: int) -> mf.PoissonStructure:
     """Return the Poisson structure of a body with baths, whose entropies have no conjugate variables."""
-    return ProductPoisson(body, mf.NoPoisson(number)) if number else body
+    return ProductPoisson(body_poisson, mf.NoPoisson(n_baths)) if n_baths else body_poisson
 
 
 class BathEntropy(Energy):
-    """The entropy of baths: the sum of the last components of a state."""
+    """The total entropy of the baths: the sum of the last components of a state."""
 
     number: int = eqx.field(static=True)
 

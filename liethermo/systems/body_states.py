@@ -22,7 +22,7 @@ TEMPERATURE_RTOL = 1e-9
 """Relative difference up to which a temperature counts as that of a bath whose temperature cannot change."""
 
 
-def is_given_by_velocity(system, x, angular_velocity, instead: str, **details) -> bool:
+def is_given_by_velocity(system, x, angular_velocity, alternative: str, **velocity_arguments) -> bool:
     """Return whether a state is given by an angular velocity, and not by x.
 
     Parameters
@@ -30,7 +30,7 @@ def is_given_by_velocity(system, x, angular_velocity, instead: str, **details) -
     system : LiePoissonSystem or EulerPoincareClosedSystem
     x, angular_velocity
         What the user gave, or None.
-    instead : str
+    alternative : str
         What to give for a system without an angular velocity.
     **details
         Arguments that belong to an angular velocity, or None.
@@ -43,22 +43,22 @@ def is_given_by_velocity(system, x, angular_velocity, instead: str, **details) -
     if angular_velocity is None:
         if x is None:
             raise InputError("state needs x or angular_velocity=")
-        if names := [f"{name}=" for name, value in details.items() if value is not None]:
+        if names := [f"{name}=" for name, value in velocity_arguments.items() if value is not None]:
             raise InputError(f"{' and '.join(names)} of a state needs angular_velocity=, not x")
         return False
     if x is not None:
         raise InputError("state needs x or angular_velocity=, got both")
     if "angular_velocity" not in system.motion_quantities.velocities:
-        raise InputError(f"a system on {system.algebra.name} has no angular velocity. Give its {instead}")
+        raise InputError(f"a system on {system.algebra.name} has no angular velocity. Give its {alternative}")
     return True
 
 
 def checked_velocity(angular_velocity, rotor_rates, dim: int, batch: bool, degrees: bool) -> jax.Array:
-    """Return the velocity (Omega, w) in radians, shape (..., dim), of an angular velocity and the rates of rotors."""
+    """Return the checked velocity (Omega, w), shape (..., dim), in radians, from the rates of a body and its rotors."""
     omega = checked_numbers(angular_velocity, "angular_velocity")
     if omega.shape[-1:] != (3,) or (omega.ndim > 1 and not batch):
-        expected = "(..., 3)" if batch else "(3,)"
-        raise InputError(f"angular_velocity must have shape {expected}, in body axes, got {omega.shape}")
+        expected_shape = "(..., 3)" if batch else "(3,)"
+        raise InputError(f"angular_velocity must have shape {expected_shape}, in body axes, got {omega.shape}")
     n_rotors = dim - 3
     rates = jnp.zeros(n_rotors) if rotor_rates is None else checked_numbers(rotor_rates, "rotor_rates")
     rates = jnp.broadcast_to(rates, (n_rotors,)) if rates.ndim == 0 and n_rotors else rates
@@ -75,7 +75,7 @@ def checked_velocity(angular_velocity, rotor_rates, dim: int, batch: bool, degre
 
 
 def broadcast_batches(*arrays: jax.Array) -> tuple[jax.Array, ...]:
-    """Broadcast arrays of shape (..., n_i) to a common batch shape."""
+    """Return arrays of shape (..., n_i) broadcast to a common batch shape."""
     batch_shapes = [array.shape[:-1] for array in arrays]
     try:
         shape = jnp.broadcast_shapes(*batch_shapes)
@@ -84,9 +84,8 @@ def broadcast_batches(*arrays: jax.Array) -> tuple[jax.Array, ...]:
     return tuple(jnp.broadcast_to(array, (*shape, array.shape[-1])) for array in arrays)
 
 
-def append_entropies(x, baths: HeatBaths, temperature) -> jax.Array:
-    """Return states of a body, shape (..., n), followed by the entropies of its baths at a temperature, if one is
-    given.
+def append_bath_entropies(body_state, baths: HeatBaths, temperature) -> jax.Array:
+    """Return body states, shape (..., n), followed by the entropies of the baths at a temperature, if it is not None.
 
     Raises
     ------
@@ -94,14 +93,14 @@ def append_entropies(x, baths: HeatBaths, temperature) -> jax.Array:
         If there are no baths, or one has not such a temperature.
     """
     if temperature is None:
-        return x
+        return body_state
     if not baths.number:
         raise InputError("temperature= needs a system with baths. Build the system with baths=lt.HeatBaths(...)")
-    return jnp.concatenate(broadcast_batches(x, entropies_of_temperatures(baths, temperature)), axis=-1)
+    return jnp.concatenate(broadcast_batches(body_state, entropies_of_temperatures(baths, temperature)), axis=-1)
 
 
 def momentum_of_velocity(energy: Energy, velocity) -> jax.Array:
-    """Return the momentum at which the gradient of an energy is a velocity, shape (..., n).
+    """Return the momentum, shape (..., n), at which the gradient of an energy is a given velocity.
 
     Raises
     ------
@@ -121,6 +120,7 @@ def momentum_of_velocity(energy: Energy, velocity) -> jax.Array:
 
 
 def _momentum_of_quadratic(energy: Quadratic, velocity) -> jax.Array:
+    """Return the momentum, shape (..., n), at which the gradient of a quadratic energy is a given velocity."""
     A, rest = energy.A, velocity if energy.b is None else velocity - energy.b
     if is_traced(A):
         return rest / A if A.ndim == 1 else jnp.linalg.solve(A, rest[..., None])[..., 0]

@@ -33,7 +33,7 @@ for larger systems it is tested for three functions."""
 
 
 class CheckRow(TableRow):
-    """One axiom with its largest relative residual over the points; ``passed`` is None for a row without a verdict."""
+    """A row of a report: an axiom with its largest relative residual; ``passed`` is None if it has no verdict."""
 
     @property
     def axiom(self) -> str:
@@ -51,7 +51,7 @@ class CheckRow(TableRow):
 
 @dataclass(frozen=True)
 class CheckReport(Tabular):
-    """Residuals of the axioms of a system, which print as a table."""
+    """A report on the axioms of a system with their residuals, which prints as a table."""
 
     rows: tuple[CheckRow, ...]
     points: int
@@ -72,11 +72,11 @@ class CheckReport(Tabular):
 
 
 def check_system(
-    system: Any, points, samples: int, seed: int, scale: float, times=None, matrices: bool = True
+    system: Any, points, samples: int, seed: int, scale: float, times=None, with_matrices: bool = True
 ) -> CheckReport:
     """Test the axioms of a system at states and return a report: see :meth:`liethermo.systems.base.System.check`.
 
-    Without ``matrices`` the tests of Pi and K are left out, for systems that satisfy them by construction.
+    Without ``with_matrices`` the tests of Pi and K are left out, for systems that satisfy them by construction.
     """
     system = system.drop_torque()
     if points is None:
@@ -89,7 +89,9 @@ def check_system(
     if system.is_driven:
         times = scale * np.random.default_rng(seed).standard_normal(len(points)) if times is None else times
         points = np.column_stack([points, np.broadcast_to(np.asarray(times, dtype=np.float64), len(points))])
-    residuals = evaluate_at_points(_axiom_residuals if matrices else _field_residuals, system, points)
+    residuals = evaluate_at_points(
+        _axiom_residuals if with_matrices else _axiom_residuals_without_matrices, system, points
+    )
     friction = residuals.pop("friction", None)
     if friction is not None:
         residuals["semidefinite"] = np.array([_indefiniteness(K) for K in friction])
@@ -114,9 +116,9 @@ def check_system(
     return CheckReport(tuple(rows), int(is_inside.sum()))
 
 
-def require_axioms(system: Any, matrices: bool) -> None:
+def require_axioms(system: Any, with_matrices: bool) -> None:
     """Raise an error if an axiom fails at random states; the constructors call it."""
-    for row in check_system(system, None, 4, 0, 1.0, matrices=matrices).rows:
+    for row in check_system(system, None, 4, 0, 1.0, with_matrices=with_matrices).rows:
         if row.passed is not False:
             continue
         kind = CasimirError if row.axiom == "Pi grad S = 0" else AxiomError
@@ -163,53 +165,54 @@ _MOMENTUM_MAP_NOTE = "a momentum map has to commute with H and lie in the kernel
 _SPECIFIC_AXIOM_NOTE = "what sets this kind of system apart does not hold"
 
 
-def _axiom_row(system: Any, name: str, values: np.ndarray, axiom: str, note: str) -> CheckRow:
+def _axiom_row(system: Any, name: str, residuals: np.ndarray, axiom: str, note: str) -> CheckRow:
+    """Return the row of the report on an axiom, from its residuals at the points, shape (points,)."""
     if name == "production":
-        smallest = float(values.min())
-        note = f"{note}: the entropy falls there" if smallest < 0.0 else note
-        return CheckRow(f"{axiom} {system.production_name}", smallest, 0.0, None, note)
-    max_residual = float(values.max())
+        min_production = float(residuals.min())
+        note = f"{note}: the entropy falls there" if min_production < 0.0 else note
+        return CheckRow(f"{axiom} {system.entropy_production_name}", min_production, 0.0, None, note)
+    max_residual = float(residuals.max())
     holds = max_residual <= AXIOM_TOLERANCE
     return CheckRow(axiom, max_residual, AXIOM_TOLERANCE, holds, "" if holds else note)
 
 
-def _momentum_map_row(system: Any, name: str, values: np.ndarray) -> CheckRow:
-    """Return the row of the report on a momentum map, from the points at which it is defined; None without such
-    points."""
-    is_defined = np.isfinite(values)
+def _momentum_map_row(system: Any, name: str, residuals: np.ndarray) -> CheckRow:
+    """Return the row of the report on a momentum map, from its residuals at the points where it is defined."""
+    is_defined = np.isfinite(residuals)
     if not is_defined.any():
         return CheckRow(name, float("nan"), AXIOM_TOLERANCE, False, "it is not finite at any of the points")
-    row = _axiom_row(system, name, values[is_defined], name, _MOMENTUM_MAP_NOTE)
+    row = _axiom_row(system, name, residuals[is_defined], name, _MOMENTUM_MAP_NOTE)
     if is_defined.all() or not row.passed:
         return row
     return CheckRow(name, row.value, AXIOM_TOLERANCE, True, f"{int((~is_defined).sum())} points outside its domain")
 
 
 def _indefiniteness(K: np.ndarray) -> float:
-    """Return the absolute value of the lowest eigenvalue if it is negative, relative to the largest entry of K."""
+    """Return how far K is from semidefinite: its lowest eigenvalue, if negative, over its largest entry."""
     scale = np.abs(K).max()
     if not 0.0 < scale < np.inf:
         return 0.0 if scale == 0.0 else np.nan
     return max(0.0, -float(np.linalg.eigvalsh((K + K.T) / 2)[0])) / scale
 
 
-def _field_residuals(system: Any, x: jax.Array) -> dict[str, jax.Array]:
-    return _axiom_residuals(system, x, matrices=False)
+def _axiom_residuals_without_matrices(system: Any, x: jax.Array) -> dict[str, jax.Array]:
+    """Return the residuals of the axioms at a point that need neither Pi nor K as a matrix, by name."""
+    return _axiom_residuals(system, x, with_matrices=False)
 
 
-def _axiom_residuals(system: Any, x: jax.Array, matrices: bool = True) -> dict[str, jax.Array]:
-    """Return the residual of each axiom at a point, relative to the terms that cancel, and the friction matrix.
+def _axiom_residuals(system: Any, x: jax.Array, with_matrices: bool = True) -> dict[str, jax.Array]:
+    """Return the residuals of the axioms at a point, by name, relative to the terms that cancel, and the matrix K.
 
     If the energy depends on time, the last component of the point is the time.
     """
     if system.is_driven:
-        return _axiom_residuals(system.at_time(x[-1]), x[:-1], matrices)
+        return _axiom_residuals(system.at_time(x[-1]), x[:-1], with_matrices)
     size: Callable = lambda a: jnp.max(jnp.abs(a), initial=0.0)  # noqa: E731
     relative: Callable = lambda a, b: a / jnp.where(b > 0.0, b, 1.0)  # noqa: E731
-    residuals = _dissipation_residuals(system, x)
+    residuals = _dissipation_input_residuals(system, x)
     original = chart_system = system
     if system.space is not None:
-        if matrices:  # otherwise it is tangent by construction
+        if with_matrices:  # otherwise it is tangent by construction
             velocity = system.vector_field(x)
             residuals["tangent"] = relative(size(velocity - project_tangent(system, x, velocity)), size(velocity))
         chart_system, _ = system.local_system(x)
@@ -220,13 +223,13 @@ def _axiom_residuals(system: Any, x: jax.Array, matrices: bool = True) -> dict[s
     dS = jnp.zeros_like(x) if system.entropy is None else system.entropy.gradient(x)
     values = system.energy.value(x) + (0.0 if system.entropy is None else system.entropy.value(x))
     residuals["domain"] = values + jnp.sum(dH) + jnp.sum(dS) + jnp.sum(rate)
-    if system.dim > MAX_MATRIX_DIM or not matrices:
+    if system.dim > MAX_MATRIX_DIM or not with_matrices:
         speed = size(system.poisson.sharp(x, dH)) + size(rate)
         if system.entropy is not None:
             residuals["casimir"] = relative(size(system.poisson.sharp(x, dS)), size(dS))
     else:
-        noncentred = None if chart_system is original else chart_system
-        matrix_residuals, speed = _matrix_residuals(system, noncentred, x, dH, dS)
+        noncentred_chart_system = None if chart_system is original else chart_system
+        matrix_residuals, speed = _matrix_residuals(system, noncentred_chart_system, x, dH, dS)
         residuals, speed = residuals | matrix_residuals, speed + size(rate)
     if system.energy_law is not None:
         flow = jnp.dot(dH, rate)
@@ -243,11 +246,11 @@ def _axiom_residuals(system: Any, x: jax.Array, matrices: bool = True) -> dict[s
         dJ = J.gradient(x)
         drift = relative(jnp.abs(jnp.dot(dJ, rate)), size(dJ) * speed)
         residuals[f"momentum map {name}"] = jnp.where(jnp.isfinite(J.value(x)), drift, jnp.nan)
-    return residuals | system.specific_residuals(x)
+    return residuals | system.specific_axiom_residuals(x)
 
 
 def _stabilizer_residual(system: Any, chart_system: Any, x) -> jax.Array:
-    """Return the largest relative component of a gradient that satisfies the constraints and is not tangent."""
+    """Return the largest part of a gradient along the stabilizer of a quotient space, relative to the gradient."""
     size: Callable = lambda a: jnp.max(jnp.abs(a), initial=0.0)  # noqa: E731
     functions = [f for f in (system.energy, system.entropy, *system.momentum_maps.values()) if f is not None]
     residuals = []
@@ -257,8 +260,8 @@ def _stabilizer_residual(system: Any, chart_system: Any, x) -> jax.Array:
     return jnp.max(jnp.stack(residuals))
 
 
-def _dissipation_residuals(system: Any, x) -> dict[str, jax.Array]:
-    """Return residuals of conditions on the arguments of dissipations, by name, the largest of equal names."""
+def _dissipation_input_residuals(system: Any, x) -> dict[str, jax.Array]:
+    """Return the residuals of conditions on the functions given to dissipations, by name, the largest of each."""
     residuals: dict[str, jax.Array] = {}
     for term in system.total_dissipation.terms:
         for name, residual in term.input_residuals(system, x).items():
@@ -266,21 +269,21 @@ def _dissipation_residuals(system: Any, x) -> dict[str, jax.Array]:
     return residuals
 
 
-def _matrix_residuals(system: Any, chart_system: Any, x, dH, dS):
-    """Return residuals of the axioms on the matrices Pi and K, and a scale of the motion, which itself may vanish.
+def _matrix_residuals(system: Any, noncentred_chart_system: Any, x, dH, dS):
+    """Return residuals of the axioms on the matrices Pi and K, by name, and a scale of the speed of the motion.
 
-    On a manifold ``chart_system`` is the system in a chart that is not centred at the point; otherwise it is None.
+    On a manifold ``noncentred_chart_system`` is the system in a chart that is not centred at the point, otherwise None.
     """
     size: Callable = lambda a: jnp.max(jnp.abs(a), initial=0.0)  # noqa: E731
     relative: Callable = lambda a, b: a / jnp.where(b > 0.0, b, 1.0)  # noqa: E731
     tensor = system.poisson.tensor(x)
     residuals = {"skew": relative(size(tensor + tensor.T), size(tensor))}
-    if system.hints.is_smooth and chart_system is None and x.size > MAX_FULL_JACOBI_DIM:
+    if system.engine_hints.is_smooth and noncentred_chart_system is None and x.size > MAX_FULL_JACOBI_DIM:
         residuals["jacobi"] = _sampled_jacobi_residual(system.poisson, x)
-    elif system.hints.is_smooth:
-        poisson = (chart_system or system).poisson
+    elif system.engine_hints.is_smooth:
+        poisson = (noncentred_chart_system or system).poisson
         variation = size(jax.jacfwd(poisson.tensor)(x))
-        if chart_system is not None:  # in normal coordinates the derivative may be rounding alone
+        if noncentred_chart_system is not None:  # in normal coordinates the derivative may be rounding alone
             variation = variation + size(tensor)
         residuals["jacobi"] = relative(poisson.jacobi_residual(x), size(tensor) * variation)
     if system.entropy is not None:
@@ -301,7 +304,7 @@ def _matrix_residuals(system: Any, chart_system: Any, x, dH, dS):
 
 
 def _sampled_jacobi_residual(poisson: Any, x) -> jax.Array:
-    """Return the sum of ``{f, {g, h}}`` and its cyclic permutations for random linear functions, relative to a term."""
+    """Return the residual of Jacobi's identity for three random linear functions, relative to its largest term."""
     covectors = np.random.default_rng(0).standard_normal((3, x.size))
 
     def term(f, g, h):

@@ -19,7 +19,7 @@ WORK_NAME = "work"
 
 
 class Clock(Module):
-    """The place of the time and the work in a state, and the span of the run, at whose breaks functions of time jump.
+    """Indices of the time and the work in a state, with the span of the run, at whose breaks functions may jump.
 
     Attributes
     ----------
@@ -30,15 +30,15 @@ class Clock(Module):
         Unit of both.
     energy_depends_on_time : bool
         Whether the energy depends on time.
-    n_last_counters : int
-        How many of the last components of a state only count too, such as an impulse.
+    n_trailing_counters : int
+        Number of components at the end of a state that only count, such as an impulse.
     """
 
     span: TimeSpan
     index: int = eqx.field(static=True)
     unit: float = eqx.field(static=True)
     energy_depends_on_time: bool = eqx.field(static=True)
-    n_last_counters: int = eqx.field(static=True, default=0)
+    n_trailing_counters: int = eqx.field(static=True, default=0)
 
     @property
     def can_energy_jump(self) -> bool:
@@ -59,7 +59,7 @@ class Clock(Module):
 
 
 class HasClock(Protocol):
-    """A system with an energy, whose states may contain the time and the work."""
+    """A system with an energy, whose states may contain a time and the work."""
 
     @property
     def energy(self) -> Energy: ...
@@ -71,8 +71,8 @@ class HasClock(Protocol):
 AnySystem = TypeVar("AnySystem", bound=HasClock)
 
 
-def system_of_step(system: AnySystem, x) -> AnySystem:
-    """Return the system for a step that starts at x, shape (n,).
+def system_between_breaks(system: AnySystem, x) -> AnySystem:
+    """Return the system with its functions of time limited to the interval of the step that starts at x.
 
     Functions of time that jump at the end of this step have their limits from before, and those that jump at its
     start their limits from after.
@@ -83,26 +83,26 @@ def system_of_step(system: AnySystem, x) -> AnySystem:
     return replace_time_span(system, clock.span.interval_between_breaks_at(clock.time(x)))
 
 
-def add_jump_of_energy(clock: Clock, x, amount) -> jax.Array:
-    """Return x, shape (n,), with a jump of the energy added to the work, if a step from x starts at a break.
+def add_energy_jump_to_work(clock: Clock, x, energy_jump) -> jax.Array:
+    """Return the state x, shape (n,), with a jump of the energy added to its work, if x is at a break of the span.
 
-    ``amount`` is the energy after the jump minus the energy before.
+    ``energy_jump`` is the energy after the jump minus the energy before.
     """
-    jump = jnp.where(clock.span.starts_at_break(clock.time(x)), clock.unit * amount, 0.0)
+    jump = jnp.where(clock.span.starts_at_break(clock.time(x)), clock.unit * energy_jump, 0.0)
     return x.at[clock.index + 1].add(jump)
 
 
-def clock_components(system: HasClock, v) -> jax.Array:
-    """Return v, shape (n,), with zeros in all components but those that only count."""
+def keep_clock_components(system: HasClock, v) -> jax.Array:
+    """Return v, shape (n,), with zeros in all components except time, work and other counters."""
     clock, index = system.clock, np.arange(v.shape[0])
     if clock is None:
         return jnp.zeros_like(v)
-    is_counter = (index == clock.index) | (index == clock.index + 1) | (index >= len(index) - clock.n_last_counters)
+    is_counter = (index == clock.index) | (index == clock.index + 1) | (index >= len(index) - clock.n_trailing_counters)
     return jnp.where(is_counter, v, 0.0)
 
 
-def error_of_step(system: HasClock, x, error, mean_slope) -> jax.Array:
-    """Return the error of a step from x, over its size, with the error of the work as one of the state, shape (n,).
+def convert_work_error_to_displacement(system: HasClock, x, error, mean_slope) -> jax.Array:
+    """Return the error of a step, shape (n,), with the error of the work converted to a displacement of the state.
 
     A step that is corrected onto the level of the energy less the work moves the state by the error of the work.
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class RunCondition:
-    """A condition of a run beside the laws of energy and entropy, for a row of its audit.
+    """A condition of a run other than the laws of energy and entropy, shown as a row of its audit.
 
     Attributes
     ----------
@@ -36,12 +36,14 @@ class RunCondition:
     is_minimum: bool = False
 
 
-def worst_conditions(runs: Iterable[Iterable[RunCondition]]) -> tuple[RunCondition, ...]:
-    """Return the conditions of several runs, for each name the one with the worst number."""
-    worst: dict[str, RunCondition] = {}
-    for condition in (condition for conditions in runs for condition in conditions):
-        other = worst.setdefault(condition.name, condition)
-        is_worse = condition.value < other.value if condition.is_minimum else condition.value > other.value
+def worst_conditions(conditions_of_runs: Iterable[Iterable[RunCondition]]) -> tuple[RunCondition, ...]:
+    """Return one condition per name, the worst among several runs."""
+    worst_by_name: dict[str, RunCondition] = {}
+    for condition in (condition for conditions in conditions_of_runs for condition in conditions):
+        worst_so_far = worst_by_name.setdefault(condition.name, condition)
+        is_worse = (
+            condition.value < worst_so_far.value if condition.is_minimum else condition.value > worst_so_far.value
+        )
         if is_worse or not math.isfinite(condition.value):
-            worst[condition.name] = condition
-    return tuple(worst.values())
+            worst_by_name[condition.name] = condition
+    return tuple(worst_by_name.values())

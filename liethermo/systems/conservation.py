@@ -15,7 +15,7 @@ from .interface import SystemInterface
 
 
 class InvariantRates(NamedTuple):
-    """Rates of change of functions along the parts of a vector field: the motion, each dissipation, a torque.
+    """Rates of change of functions along each part of a vector field: the motion, each dissipation, a torque.
 
     Attributes
     ----------
@@ -28,7 +28,7 @@ class InvariantRates(NamedTuple):
     scales: jax.Array
 
 
-def rates_of_change(model: tuple[SystemInterface, tuple[Energy, ...]], x) -> InvariantRates:
+def function_rates_of_change(system_and_functions: tuple[SystemInterface, tuple[Energy, ...]], x) -> InvariantRates:
     """Return the rates of change of functions at x along the motion, along each dissipation and along a torque.
 
     The speed of a dissipation is the norm of its force, or of its force for other gradients of equal length if that is
@@ -36,10 +36,10 @@ def rates_of_change(model: tuple[SystemInterface, tuple[Energy, ...]], x) -> Inv
 
     Parameters
     ----------
-    model : (System, tuple of Energy)
+    system_and_functions : (System, tuple of Energy)
     x : array, shape (n,)
     """
-    system, functions = model
+    system, functions = system_and_functions
     gradients = jnp.stack([f.gradient(x) for f in functions])
     dH = project_covector(system, x, system.energy.gradient(x))
     dS = jnp.zeros_like(x) if system.entropy is None else project_covector(system, x, system.entropy.gradient(x))
@@ -75,19 +75,19 @@ def dissipation_keeps_casimirs(system: SystemInterface) -> bool:
 
 
 def project_covector(system: SystemInterface, x, alpha) -> jax.Array:
-    """Return the part of a covector that acts on tangent vectors: alpha itself on R^n."""
+    """Return the part of a covector, shape (n,), that acts on tangent vectors of the space; alpha itself on R^n."""
     return alpha if system.space is None else system.lower_index(x, system.raise_index(x, alpha))
 
 
 def _is_spanned(gradients, vectors) -> jax.Array:
-    """Return which of the gradients, shape (m, n), are linear combinations of vectors, shape (m,)."""
+    """Return for each gradient, shape (m, n), whether it is a linear combination of some vectors: bools, shape (m,)."""
     project_off = gram_schmidt(vectors).project_off
     remainders = jnp.stack([project_off(gradient) for gradient in gradients])
     return jnp.sum(remainders**2, axis=1) <= (AXIOM_TOLERANCE**2) * jnp.sum(gradients**2, axis=1)
 
 
 class PointwiseVerdicts(NamedTuple):
-    """Verdicts on the conservation of functions at several states.
+    """Verdicts at several states on whether functions are conserved.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class PointwiseVerdicts(NamedTuple):
 
 
 def judge_conservation(rates: InvariantRates, tolerance: float = AXIOM_TOLERANCE) -> PointwiseVerdicts:
-    """Return at which points each function is conserved, for rates of NumPy or of JAX.
+    """Return verdicts at each point on whether functions are conserved, from their rates (NumPy or JAX).
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def judge_conservation(rates: InvariantRates, tolerance: float = AXIOM_TOLERANCE
 
 
 def is_proportional(f: np.ndarray, g: np.ndarray) -> np.ndarray:
-    """Return whether the vector field f is a constant multiple of the vector field g, shape (...).
+    """Return whether the sampled vector field f is a constant multiple of g: bools, shape (...).
 
     Parameters
     ----------
@@ -130,8 +130,8 @@ def is_proportional(f: np.ndarray, g: np.ndarray) -> np.ndarray:
     f, g = (np.where(is_finite[..., None], field, 0.0) for field in (f, g))
     f_norms, g_norms = np.linalg.norm(f, axis=-1), np.linalg.norm(g, axis=-1)
     same_zeros = ((f_norms > 0.0) == (g_norms > 0.0)).all(axis=-1) & (f_norms > 0.0).any(axis=-1)
-    largest = np.argmax(g_norms, axis=-1)[..., None, None]
-    a, b = (np.take_along_axis(field, largest, axis=-2)[..., 0, :] for field in (f, g))
+    index_of_largest = np.argmax(g_norms, axis=-1)[..., None, None]
+    a, b = (np.take_along_axis(field, index_of_largest, axis=-2)[..., 0, :] for field in (f, g))
     i = np.argmax(np.abs(b), axis=-1)[..., None]
     with np.errstate(divide="ignore", invalid="ignore"):
         factor = np.take_along_axis(a, i, axis=-1) / np.take_along_axis(b, i, axis=-1)

@@ -10,13 +10,13 @@ import jax
 
 
 def _empty_reason(x) -> str:
-    """Return "", since every state of the system is allowed."""
+    """Return "", the reason of a domain that allows every state."""
     return ""
 
 
 @dataclass(frozen=True)
 class Domain:
-    """Conditions that a state must satisfy beside finite components; by default there are none.
+    """Conditions that a state must satisfy besides being finite; by default there are none.
 
     Attributes
     ----------
@@ -43,6 +43,6 @@ class Domain:
         return self.why_outside == _empty_reason and self.why_singular == _empty_reason
 
     def margin_at(self, x) -> jax.Array:
-        """Return the margin of a domain that has one, at a state, shape (n,)."""
+        """Return the margin of the domain at a state, shape (n,): positive if the parameters allow the state."""
         assert self.margin is not None
         return self.margin(x)

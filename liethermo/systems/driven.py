@@ -42,7 +42,7 @@ class DrivenSystem(LiftedSystem):
     energy, so it conserves ``H - W`` for every gradient, continuous or discrete.
 
     Functions of time may jump at the breaks of the span. There a step ends, which sees the limit from before, and the
-    next one sees the limit from after [:func:`.clock.system_of_step`]. A jump of H at a fixed state is work.
+    next one sees the limit from after [:func:`.clock.system_between_breaks`]. A jump of H at a fixed state is work.
 
     A state consists of the state of the body, t and W, in units of ``unit``. :func:`liethermo.integrate` builds it from
     a system whose energy depends on time, or on which a torque acts.
@@ -91,7 +91,7 @@ class DrivenSystem(LiftedSystem):
         return WrappedSystem(self.body, DrivenSystem, (self.unit,))
 
     def initial_state(self, x, t: float = 0.0, attitude=None, batch: bool = False) -> jax.Array:
-        """Return the state at a time with zero work; several states with ``batch``."""
+        """Return the state at the time t with zero work, shape (dim,); several states with ``batch``."""
         x = jnp.asarray(self.body.initial_state(x, t, attitude, batch))
         clock = jnp.broadcast_to(jnp.array([t * self.unit, 0.0]), (*x.shape[:-1], 2))
         return jnp.concatenate([x, clock], axis=-1)
@@ -114,54 +114,56 @@ class DrivenSystem(LiftedSystem):
     def run_conditions(self, x, t, guarantees):
         return self.body.run_conditions(x[:, :-2], t, guarantees)
 
-    def _inner_at_first(self, x) -> System:
+    def _inner_system_at_first_state(self, x) -> System:
         t = float(np.reshape(x, (-1, self.dim))[0, -2]) / self.unit
         return self._body_at_time(min(max(t, float(self.span.start)), float(self.span.end)))
 
-    def component_scales(self, k):
-        clock = jnp.full((*k.shape[:-1], 2), self.unit)
-        return jnp.concatenate([self.body.component_scales(k[..., :-2]), clock], axis=-1)
+    def slope_scales(self, slopes):
+        clock = jnp.full((*slopes.shape[:-1], 2), self.unit)
+        return jnp.concatenate([self.body.slope_scales(slopes[..., :-2]), clock], axis=-1)
 
     # -- dynamics ---------------------------------------------------------------------------------------------------
 
-    @property
-    def inner(self) -> System:
-        return self.body
-
-    def inner_at(self, x) -> System:
+    def inner_system_at(self, x) -> System:
         return self._body_at_time(self.time(x))
 
     body_dim = forward_to("body")
 
     def field(self, x, dH, dS, dL=()):
-        motion = self.inner_at(x).drop_torque().field(*self.inner_arguments(x, dH, dS, dL))
+        motion = self.inner_system_at(x).drop_torque().field(*self.restrict_to_inner_state(x, dH, dS, dL))
         motion = jnp.concatenate([motion, _clock_velocity(dH, self.unit)])
         return motion + self.torque_velocity(x, dH) if self.torque_laws.name else motion
 
     def external_torque(self, x):
-        return self.inner_at(x).external_torque(x[:-2]) if self.torque is None else self.torque
+        return self.inner_system_at(x).external_torque(x[:-2]) if self.torque is None else self.torque
 
     def torque_velocity(self, x, dH) -> jax.Array:
-        """Return the velocity that a torque gives to a state, power included, for a continuous or discrete gradient."""
-        velocity = self.inner_at(x).external_velocity(x[:-2], dH[:-2]) if self.torque is None else self.torque
+        """Return the velocity that the torque gives to a state, power included, shape (dim,), at a gradient dH."""
+        velocity = self.inner_system_at(x).external_velocity(x[:-2], dH[:-2]) if self.torque is None else self.torque
         assert velocity is not None
         return jnp.concatenate([velocity, jnp.stack([jnp.zeros(()), self.unit * jnp.dot(dH[:-2], velocity)])])
 
     def bind_attitude(self, attitude) -> DrivenSystem:
-        """Return the system with its torque evaluated at an attitude, shape (m, m)."""
+        """Return the system with its torque evaluated at a fixed attitude, shape (m, m)."""
         return replace_fields(self, attitude=attitude) if self.torque_laws.needs_attitude else self
 
-    def solve_at_spins(self, x, dH, dS, noise_rates, others, half_step, k):
-        inner, clock_velocity = self.inner_at(x).drop_torque(), _clock_velocity(dH, self.unit) + others[-2:]
+    def solve_slopes_at_each_spin(self, x, dH, dS, noise_rates, other_noise_velocity, half_step, k):
+        inner, clock_velocity = (
+            self.inner_system_at(x).drop_torque(),
+            _clock_velocity(dH, self.unit) + other_noise_velocity[-2:],
+        )
         if self.torque_laws.name:
             torque_velocity = self.torque_velocity(x, dH)
-            others, clock_velocity = others + torque_velocity, clock_velocity + torque_velocity[-2:]
-        x, dH, dS, _ = self.inner_arguments(x, dH, dS, ())
-        slopes = inner.solve_at_spins(x, dH, dS, noise_rates, others[:-2], half_step, k[:-2])
+            other_noise_velocity, clock_velocity = (
+                other_noise_velocity + torque_velocity,
+                clock_velocity + torque_velocity[-2:],
+            )
+        x, dH, dS, _ = self.restrict_to_inner_state(x, dH, dS, ())
+        slopes = inner.solve_slopes_at_each_spin(x, dH, dS, noise_rates, other_noise_velocity[:-2], half_step, k[:-2])
         return None if slopes is None else jnp.concatenate([slopes, clock_velocity])
 
     def raise_index(self, x, alpha):
-        """Return the direction of a correction along alpha, without components along the clock and the work."""
+        """Return the direction of a correction along alpha, with zeros for time and work."""
         return jnp.concatenate([self.body.raise_index(x[:-2], alpha[:-2]), jnp.zeros(2)])
 
     def _body_at_time(self, t) -> System:
@@ -170,11 +172,11 @@ class DrivenSystem(LiftedSystem):
     # -- functions ----------------------------------------------------------------------------------------------------
 
     def pullback(self, energy: Energy) -> Energy:
-        return self.extend(self.body.energy_of_vectors(energy))
+        return self.extend(self.body.energy_of_flat_states(energy))
 
     def _extend_term(self, term: Energy) -> Energy:
-        clock = _ClockMap(self.body.dim, self.unit)
-        return _TimedEnergy(term.with_time(), clock) if term.depends_on_time else self.extend(term)
+        clock = _StateTimeMap(self.body.dim, self.unit)
+        return _EnergyOfStateAndTime(term.with_time(), clock) if term.depends_on_time else self.extend(term)
 
     @property
     def ledger(self):
@@ -194,7 +196,7 @@ class DrivenSystem(LiftedSystem):
 
 
 class _ClockPoisson(PoissonBySharp):
-    """The Poisson tensor ``[[0, -1], [1, 0]]`` on (t, W), in units of ``unit``."""
+    """The Poisson structure of time and work, with the tensor ``[[0, -1], [1, 0]]`` in units of ``unit``."""
 
     unit: float = eqx.field(static=True)
 
@@ -217,7 +219,7 @@ def _clock_velocity(dH, unit: float) -> jax.Array:
 
 
 class _TorqueForce(SkewFriction):
-    """The torque on a body and the work that it does."""
+    """A torque on a body as a force that conserves energy minus work."""
 
     is_noiseless = True
     preserves_casimirs = True  # but those that :attr:`System.torque_laws` lists as changed
@@ -226,8 +228,8 @@ class _TorqueForce(SkewFriction):
         return system.torque_velocity(x, dH)
 
 
-class _ClockMap(ComponentMap):
-    """The map from a state with clock and work to (x, t)."""
+class _StateTimeMap(ComponentMap):
+    """The map from a state with time and work to (x, t), shape (dim + 1,)."""
 
     dim: int = eqx.field(static=True)
     unit: float = eqx.field(static=True)
@@ -237,7 +239,7 @@ class _ClockMap(ComponentMap):
 
 
 class _NegativeWork(Pullback):
-    """The energy ``-W``, minus the last component of a state."""
+    """The energy ``-W``, where W is the last component of a state."""
 
     def __init__(self, unit: float):
         super().__init__(Linear(jnp.array([-1.0 / unit])), [-1])
@@ -247,20 +249,20 @@ class _NegativeWork(Pullback):
         return Quadratic(jnp.zeros(space.dim), self.gradient(jnp.zeros(space.dim)), value)
 
 
-class _TimedEnergy(Pullback):
-    """A function of states with clock and work, from a function of (x, t), shape (n + 1,)."""
+class _EnergyOfStateAndTime(Pullback):
+    """A function of states with time and work, computed from a function of (x, t), shape (n + 1,)."""
 
-    coordinates: _ClockMap
+    coordinates: _StateTimeMap
 
     def pullback_to_chart(self, coordinates, space, start=None):
-        clock = _ClockMap(space.dim - 2, self.coordinates.unit)
+        clock = _StateTimeMap(space.dim - 2, self.coordinates.unit)
         return Pullback(
-            StateTimeEnergy(_TimedChartEnergy(ChartEnergy(self, coordinates, space, start), clock.unit)), clock
+            StateTimeEnergy(_ChartEnergyOfTime(ChartEnergy(self, coordinates, space, start), clock.unit)), clock
         )
 
 
-class _TimedChartEnergy(Energy):
-    """A function of (c, t), from a function of coordinates, clock and work that does not depend on the work."""
+class _ChartEnergyOfTime(Energy):
+    """A function of (c, t), computed from a function of chart coordinates, time and work."""
 
     energy: Energy
     unit: float = eqx.field(static=True)
@@ -270,7 +272,7 @@ class _TimedChartEnergy(Energy):
 
 
 def make_autonomous(system: System, unit: float = CLOCK_UNIT) -> System:
-    """Return the system with clock and work if work is done from outside; otherwise the system itself.
+    """Return a driven system extended by time and work, so that it is autonomous; other systems unchanged.
 
     Raises
     ------

@@ -37,103 +37,116 @@ MANIFOLD_OFFSET = 0.05
 
 
 class EmbeddedSystem(System):
-    """A system on states x, shape (n,), the flattened arrays of the space; :func:`embed_in_arrays` builds it.
+    """A system on a manifold, extended to the flat arrays around it, shape (n,); :func:`embed_in_arrays` builds it.
 
     Attributes
     ----------
-    manifold : System
+    manifold_system : System
     is_tangent : bool
         Whether the motion is tangent to the level sets of the constraints without a projection.
     is_projection_trivial : bool
         Whether the projection leaves the motion unchanged, so that the force is not projected either.
     """
 
-    manifold: System
+    manifold_system: System
     is_tangent: bool = eqx.field(static=True)
     is_projection_trivial: bool = eqx.field(static=True)
 
-    def __init__(self, manifold: System, is_tangent: bool = False, is_projection_trivial: bool = False):
-        self.manifold, self.is_tangent, self.is_projection_trivial = manifold, is_tangent, is_projection_trivial
-        self.dim, self.space, self.baths = manifold.dim, None, manifold.baths
-        self.energy = with_polynomial_degrees(manifold.energy, self.dim)
-        self.entropy = None if manifold.entropy is None else with_polynomial_degrees(manifold.entropy, self.dim)
-        needs_no_projection = is_tangent or isinstance(manifold.poisson, mf.NoPoisson)
-        self.poisson = manifold.poisson if needs_no_projection else _TangentPoisson(manifold)
-        self.dissipation = _TangentDissipation.lift_terms(
-            manifold.dissipation, self._mark_polynomial_degrees, manifold, is_projection_trivial
+    def __init__(self, manifold_system: System, is_tangent: bool = False, is_projection_trivial: bool = False):
+        self.manifold_system, self.is_tangent, self.is_projection_trivial = (
+            manifold_system,
+            is_tangent,
+            is_projection_trivial,
         )
-        self.momentum_maps = {name: self._mark_polynomial_degrees(J) for name, J in manifold.momentum_maps.items()}
-        self.preserved_labels, self.invariant_verdicts = manifold.preserved_labels, manifold.invariant_verdicts
+        self.dim, self.space, self.baths = manifold_system.dim, None, manifold_system.baths
+        self.energy = with_polynomial_degrees(manifold_system.energy, self.dim)
+        self.entropy = (
+            None if manifold_system.entropy is None else with_polynomial_degrees(manifold_system.entropy, self.dim)
+        )
+        needs_no_projection = is_tangent or isinstance(manifold_system.poisson, mf.NoPoisson)
+        self.poisson = manifold_system.poisson if needs_no_projection else _TangentPoisson(manifold_system)
+        self.dissipation = _TangentDissipation.lift_terms(
+            manifold_system.dissipation, self._mark_polynomial_degrees, manifold_system, is_projection_trivial
+        )
+        self.momentum_maps = {
+            name: self._mark_polynomial_degrees(J) for name, J in manifold_system.momentum_maps.items()
+        }
+        self.preserved_labels, self.invariant_verdicts = (
+            manifold_system.preserved_labels,
+            manifold_system.invariant_verdicts,
+        )
 
     def _mark_polynomial_degrees(self, energy: Energy) -> Energy:
         return with_polynomial_degrees(energy, self.dim)
 
-    kind = forward_to("manifold")
+    kind = forward_to("manifold_system")
 
     @property
     def domain(self) -> Domain:
-        name, why_singular = _require_space(self.manifold).name, self.manifold.domain.why_singular
+        name, why_singular = _require_space(self.manifold_system).name, self.manifold_system.domain.why_singular
         return Domain(f"a point of {name}", self._why_outside, why_singular)
 
-    ledger = forward_to("manifold")
+    ledger = forward_to("manifold_system")
 
     @property
     def wrapped_system(self) -> WrappedSystem:
-        return WrappedSystem(self.manifold, EmbeddedSystem, (self.is_tangent, self.is_projection_trivial))
+        return WrappedSystem(self.manifold_system, EmbeddedSystem, (self.is_tangent, self.is_projection_trivial))
 
     @property
-    def surface(self) -> ConstraintSurface:
-        return ConstraintSurface(_require_space(self.manifold), self.is_tangent)
+    def constraint_surface(self) -> ConstraintSurface:
+        return ConstraintSurface(_require_space(self.manifold_system), self.is_tangent)
 
     def _why_outside(self, x) -> str:
-        space, x = _require_space(self.manifold), np.atleast_2d(x)
+        space, x = _require_space(self.manifold_system), np.atleast_2d(x)
         if not np.isfinite(x).all():
             return ""
-        is_inside = evaluate_at_points(_inside_indicator, self.surface, x) > 0.0
+        is_inside = evaluate_at_points(_inside_indicator, self.constraint_surface, x) > 0.0
         if is_inside.all():
-            return self.manifold.domain.why_outside(x)
+            return self.manifold_system.domain.why_outside(x)
         point = np.asarray(self.points(x[is_inside.argmin()]))
         return f"the step leaves {space.name}: {space._why_off_space(point, np.inf)}"
 
     # -- states -------------------------------------------------------------------------------------------------------
 
-    points = forward_to("manifold")
-    state_array = forward_to("manifold")
-    energy_of_vectors = forward_to("manifold")
-    samples = forward_to("manifold")
-    drop_baths = forward_to("manifold")
+    points = forward_to("manifold_system")
+    state_array = forward_to("manifold_system")
+    energy_of_flat_states = forward_to("manifold_system")
+    samples = forward_to("manifold_system")
+    drop_baths = forward_to("manifold_system")
 
     def to_user_solution(self, solution):
-        name = dissipation_name(self.manifold.dissipation)
-        return self.manifold.to_user_solution(
-            solution.with_provenance(system=type(self.manifold).__name__, dissipation=name)
+        name = dissipation_name(self.manifold_system.dissipation)
+        return self.manifold_system.to_user_solution(
+            solution.with_provenance(system=type(self.manifold_system).__name__, dissipation=name)
         )
 
     # -- dynamics -----------------------------------------------------------------------------------------------------
 
     def at_time(self, t, attitude=None) -> EmbeddedSystem:
-        return EmbeddedSystem(self.manifold.at_time(t), *self.wrapped_system.arguments) if self.is_driven else self
+        return (
+            EmbeddedSystem(self.manifold_system.at_time(t), *self.wrapped_system.arguments) if self.is_driven else self
+        )
 
     def raise_index(self, x, alpha):
-        """Return the part of a gradient tangent to the constraint level sets; corrections move the state along it."""
-        return _tangential_part(self.manifold, x, alpha)
+        """Return the part of a gradient tangent to the constraint level sets, along which corrections move a state."""
+        return _tangential_part(self.manifold_system, x, alpha)
 
     @property
-    def hints(self) -> EngineHints:
-        is_smooth = self.manifold.hints.is_smooth
-        return super().hints._replace(can_unroll=is_smooth, is_smooth=is_smooth)
+    def engine_hints(self) -> EngineHints:
+        is_smooth = self.manifold_system.engine_hints.is_smooth
+        return super().engine_hints._replace(can_unroll=is_smooth, is_smooth=is_smooth)
 
 
 class _TangentPoisson(PoissonBySharp):
-    """The Poisson tensor ``P Pi P``, with the projector P to the level sets of the constraints."""
+    """The Poisson tensor ``P Pi P`` near a manifold, with the projector P to the level sets of the constraints."""
 
-    manifold: System
+    manifold_system: System
 
-    dim = forward_to("manifold")
+    dim = forward_to("manifold_system")
 
     def sharp(self, x, alpha):
-        motion = self.manifold.poisson.sharp(x, _tangential_part(self.manifold, x, alpha))
-        return _tangential_part(self.manifold, x, motion)
+        motion = self.manifold_system.poisson.sharp(x, _tangential_part(self.manifold_system, x, alpha))
+        return _tangential_part(self.manifold_system, x, motion)
 
 
 class _TangentDissipation(LiftedDissipation):
@@ -143,31 +156,31 @@ class _TangentDissipation(LiftedDissipation):
     projector off the manifold.
     """
 
-    manifold: System
+    manifold_system: System
     is_projection_trivial: bool = eqx.field(static=True)
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
-        """Return the manifold with projected gradients, whose digits near an equilibrium are exact."""
-        project = functools.partial(_tangential_part, self.manifold, x)
-        return LiftedGeometry(self.manifold, x, project, project)
+        """Return the system on the manifold, with gradients and velocities projected to the constraint level sets."""
+        project = functools.partial(_tangential_part, self.manifold_system, x)
+        return LiftedGeometry(self.manifold_system, x, project, project)
 
     def force(self, system, x, dH, dS, dL):
         return _tangent_force(self, x, dH, dS, dL)
 
     def divergence(self, system, x):
-        """Return the divergence with respect to the volume of the manifold."""
-        return self.inner.divergence(self.manifold, system.surface.project_state(x))
+        """Return the divergence of the noise with respect to the volume of the manifold."""
+        return self.inner.divergence(self.manifold_system, system.constraint_surface.project_state(x))
 
 
 @jit_subprogram
-def _tangent_force(force: _TangentDissipation, x, dH, dS, dL) -> jax.Array:
-    geometry = force.lifted_geometry(force.manifold, x)
-    velocity = force.inner.force(geometry.system, geometry.x, *geometry.inner_gradients(dH, dS, dL))
-    return velocity if force.is_projection_trivial else geometry.lower(velocity)
+def _tangent_force(dissipation: _TangentDissipation, x, dH, dS, dL) -> jax.Array:
+    geometry = dissipation.lifted_geometry(dissipation.manifold_system, x)
+    velocity = dissipation.inner.force(geometry.system, geometry.x, *geometry.inner_gradients(dH, dS, dL))
+    return velocity if dissipation.is_projection_trivial else geometry.lower_velocity(velocity)
 
 
 def embed_in_arrays(system: System) -> System:
-    """Return the system embedded in the arrays of its space; itself on R^n, or if it can run in charts only."""
+    """Return the system extended to the arrays around its space; unchanged on R^n, or if only charts are possible."""
     if system.space is None or not system.space.can_be_embedded:
         return system
     if is_traced(system):
@@ -180,32 +193,33 @@ def embed_in_arrays(system: System) -> System:
 
 
 def _sample_states(system: System) -> np.ndarray:
-    """Return a few random states, without compiling a program if the space maps normal numbers to points."""
+    """Return three random states, shape (3, n), without compiling a program if the space allows it."""
     space = _require_space(system)
     if space._n_gaussian_samples is None:
         return system.samples(3)
     return evaluate_at_points(
-        _state_from_normals, space, np.random.default_rng(2).standard_normal((3, space._n_gaussian_samples))
+        _state_from_gaussian_samples, space, np.random.default_rng(2).standard_normal((3, space._n_gaussian_samples))
     )
 
 
-def _state_from_normals(space: mf.Space, w):
-    return space.to_vector(space._point_from_gaussian_samples(w))
+def _state_from_gaussian_samples(space: mf.Space, gaussian_samples):
+    """Return the state, shape (n,), that a space computes from standard normal numbers."""
+    return space.to_vector(space._point_from_gaussian_samples(gaussian_samples))
 
 
-def _inside_indicator(surface: ConstraintSurface, x):
+def _inside_indicator(surface: ConstraintSurface, state):
     """Return 1.0 if the point of the surface nearest to a state is in the space, otherwise 0.0."""
-    return jnp.where(surface.is_in_space(surface.project_state(x)), 1.0, 0.0)
+    return jnp.where(surface.is_in_space(surface.project_state(state)), 1.0, 0.0)
 
 
 def _tangency_residuals(system: System, x):
-    """Return how much of a field is not tangent, and how much projecting changes it, relative to the field's norm.
+    """Return the part of the field that is not tangent, and its change by projection, relative to its norm.
 
     A field is tangent if it conserves the constraints and does not depend on normal components of covectors. The
     second value is separate, because off the manifold the projection need not be a projector.
     """
     constraints, pull = jax.vjp(functools.partial(_constraint_values, _require_space(system)), x)
-    random, n_covectors = np.random.default_rng(1), 3 + len(system.preserved)
+    random, n_covectors = np.random.default_rng(1), 3 + len(system.preserved_functions)
     covectors = random.standard_normal((n_covectors, x.shape[0]))
     normals = [pull(jnp.asarray(w))[0] for w in random.standard_normal((n_covectors, *constraints.shape))]
     fields = []
@@ -219,11 +233,12 @@ def _tangency_residuals(system: System, x):
 
 
 def _constraint_values(space: mf.Space, x):
+    """Return the values of the constraints of a space at a state."""
     return space._constraints(space.from_vector(x))
 
 
 def _tangential_part(system: System, x, w):
-    """Return an array without the component that would change the constraints of the space."""
+    """Return an array w without the component that would change the constraints of the space."""
     return _tangential_part_in_space(_require_space(system), x, w)
 
 
@@ -238,7 +253,7 @@ def _require_space(system: System) -> mf.Space:
 
 
 class ChartSystem(System):
-    """A system on a manifold in coordinates c of a chart, shape (dim,).
+    """A system on a manifold, in coordinates c of a chart, shape (dim,).
 
     Parameters
     ----------
@@ -251,14 +266,14 @@ class ChartSystem(System):
         State vector at the start of the step, for a system that serves one step.
     """
 
-    manifold: System
+    manifold_system: System
     coordinates: mf.Coordinates
     place: mf.Place | None
     start: jax.Array | None
 
     def __init__(self, system: System, coordinates: mf.Coordinates, place: mf.Place | None = None, start=None):
         assert system.space is not None
-        self.manifold, self.coordinates, self.place, self.start = system, coordinates, place, start
+        self.manifold_system, self.coordinates, self.place, self.start = system, coordinates, place, start
         self.dim, self.space, self.momentum_maps = system.space.dim, None, {}
         self.energy = self.pullback(system.energy)
         self.entropy = None if system.entropy is None else self.pullback(system.entropy)
@@ -269,42 +284,48 @@ class ChartSystem(System):
         self.preserved_labels, self.invariant_verdicts = system.preserved_labels, system.invariant_verdicts
 
     def pullback(self, energy: Energy) -> Energy:
-        """Return a function of coordinates from a function of states."""
-        space = self.manifold.space
+        """Return a function of chart coordinates from a function of states."""
+        space = self.manifold_system.space
         assert space is not None
         return energy.map_terms(lambda term: term.pullback_to_chart(self.coordinates, space, self.start))
 
     @property
-    def hints(self) -> EngineHints:
-        return super().hints._replace(is_smooth=self.manifold.hints.is_smooth, has_fixed_levels=False)
+    def engine_hints(self) -> EngineHints:
+        return super().engine_hints._replace(
+            is_smooth=self.manifold_system.engine_hints.is_smooth, has_fixed_levels=False
+        )
 
-    def freeze_at(self, x) -> System:
+    def cache_tensors_at(self, x) -> System:
         if self.place is not None:
             return self
-        return ChartSystem(self.manifold, self.coordinates, self.coordinates.at(x), self.start)
+        return ChartSystem(self.manifold_system, self.coordinates, self.coordinates.at(x), self.start)
 
     def field(self, x, dH, dS, dL=()):
-        point = _ChartPoint(self.manifold, self.coordinates, self.place, x)
-        dS, dL = None if dS is None else point.lift(dS), tuple(map(point.lift, dL))
-        return point.lower(self.manifold.field(point.state, point.lift(dH), dS, dL))
+        point = _ChartPoint(self.manifold_system, self.coordinates, self.place, x)
+        dS, dL = None if dS is None else point.lift_covector(dS), tuple(map(point.lift_covector, dL))
+        return point.lower_velocity(self.manifold_system.field(point.state, point.lift_covector(dH), dS, dL))
 
 
 class _ChartPoint:
-    """A point of the manifold with the maps between covectors and velocities of coordinates and of states."""
+    """A point of a manifold, with maps of covectors and velocities between chart coordinates and states."""
 
     def __init__(self, system: System, coordinates: mf.Coordinates, place: mf.Place | None, c):
         assert system.space is not None
         self._space, self._place = system.space, coordinates.at(c) if place is None else place
         self.state = self._space.to_vector(self._place.point)
 
-    def lift(self, alpha):
+    def lift_covector(self, alpha):
+        """Return the covector of states, shape (n,), of a covector of coordinates, shape (dim,)."""
         return self._space.to_vector(self._place.lift(alpha).conj())
 
-    def lower(self, v):
+    def lower_velocity(self, v):
+        """Return the velocity of coordinates, shape (dim,), of a velocity of states, shape (n,)."""
         return self._place.lower(self._space.from_vector(v))
 
 
 class _ChartPoisson(PoissonBySharp):
+    """The Poisson structure of a system in coordinates of a chart."""
+
     system: System
     coordinates: mf.Coordinates
     place: mf.Place | None
@@ -316,18 +337,20 @@ class _ChartPoisson(PoissonBySharp):
 
     def sharp(self, x, alpha):
         point = _ChartPoint(self.system, self.coordinates, self.place, x)
-        return point.lower(self.system.poisson.sharp(point.state, point.lift(alpha)))
+        return point.lower_velocity(self.system.poisson.sharp(point.state, point.lift_covector(alpha)))
 
 
 class _ChartDissipation(LiftedDissipation):
+    """The dissipation of a system in coordinates of a chart."""
+
     system: System
     coordinates: mf.Coordinates
     place: mf.Place | None
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
         point = _ChartPoint(self.system, self.coordinates, self.place, x)
-        return LiftedGeometry(self.system, point.state, point.lift, point.lower)
+        return LiftedGeometry(self.system, point.state, point.lift_covector, point.lower_velocity)
 
     def divergence(self, system, x):
-        """Return the divergence with respect to the volume of the manifold."""
+        """Return the divergence of the noise with respect to the volume of the manifold."""
         return self.inner.divergence(self.system, _ChartPoint(self.system, self.coordinates, self.place, x).state)

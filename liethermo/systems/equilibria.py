@@ -21,14 +21,14 @@ from .linearisation import (
     FieldDerivatives,
     Linearisation,
     Stability,
+    abbreviate_names,
     conserved_functions,
-    counter_components,
-    derivatives_at,
+    evaluate_functions,
     field_derivatives,
-    frozen_system,
-    joined_names,
+    field_derivatives_and_invariants,
+    freeze_system,
+    heat_counter_indices,
     linearise_at,
-    values_of,
 )
 
 RESIDUAL_RTOL = 1e-11
@@ -62,7 +62,7 @@ STEP_GROWTH_LIMIT = 10.0
 
 @dataclass(frozen=True, eq=False)
 class Equilibrium:
-    """A state at rest, with its linear motion.
+    """A state at rest, with the linear motion near it.
 
     Attributes
     ----------
@@ -86,16 +86,16 @@ class Equilibrium:
 
     @property
     def stability(self) -> Stability:
-        """Stability on the leaf."""
+        """Stability of the equilibrium on its leaf."""
         return self.linearisation.stability
 
     @property
     def stable(self) -> bool | None:
-        """True if it is stable on its leaf, False if not; None if that is not decided."""
+        """True if the equilibrium is stable on its leaf, False if not; None if the linear motion does not decide."""
         return self.linearisation.stable
 
     def __str__(self) -> str:
-        levels = joined_names([f"{name} = {value:.6g}" for name, value in self.levels.items()])
+        levels = abbreviate_names([f"{name} = {value:.6g}" for name, value in self.levels.items()])
         x = np.where(np.abs(self.x) > PRINTED_ZERO * np.abs(self.x).max(initial=0.0), self.x, 0.0)
         return f"{np.array2string(x, precision=6)}  {self.stability}, residual {self.residual:.1e}; {levels}"
 
@@ -130,16 +130,16 @@ class Equilibria(Sequence, metaclass=ListedABCMeta):
 
     @property
     def x(self) -> np.ndarray:
-        """The states, shape (equilibria, n)."""
+        """The states at rest, shape (equilibria, n)."""
         return np.array([member.x for member in self.members])
 
     @property
     def stable(self) -> list[bool | None]:
-        """Verdict on each one: True if it is stable on its leaf, False if not, None if that is not decided."""
+        """List of verdicts: True for an equilibrium that is stable on its leaf, False if not, None if undecided."""
         return [member.stable for member in self.members]
 
     def __str__(self) -> str:
-        levels = f" with the reference's {joined_names(self.level_names)}" if self.level_names else ""
+        levels = f" with the reference's {abbreviate_names(self.level_names)}" if self.level_names else ""
         head = f"{len(self)} equilibria{levels}, from {self.n_converged} of {self.n_starts} starting points"
         return "\n".join([head, *map(str, self.members)])
 
@@ -154,7 +154,7 @@ def equilibria(
     seed: int = 0,
     t: float | None = None,
 ) -> Equilibria:
-    """Return the equilibria of a system that a search finds on the leaf of a reference state.
+    """Find equilibria of a system on the leaf of a reference state, and return them with their stability.
 
     The search solves ``x' = 0`` together with the values of the conserved functions by the Levenberg-Marquardt method,
     from each starting point. It finds stable and unstable equilibria. A search from random points does not prove that
@@ -197,17 +197,17 @@ def equilibria(
     >>> len(rest), sorted(map(str, rest.stable))
     (6, ['False', 'False', 'True', 'True', 'True', 'True'])
     """
-    system = frozen_system(system, t)
+    system = freeze_system(system, t)
     anchor = None if reference is None else np.asarray(system.state(reference))
     points = _starting_points(system, anchor, starts, count, seed)
-    conserved = conserved_functions(system, points[0])
-    names = _level_names(system, conserved, levels, points) if anchor is not None else ()
-    fixed = {name: conserved[name] for name in names}
-    targets = None if anchor is None else values_of(tuple(fixed.values()), anchor[None])[0]
-    search = _Search(system, tuple(fixed.values()), targets, counter_components(system))
+    conserved_by_name = conserved_functions(system, points[0])
+    names = _fixed_function_names(system, conserved_by_name, levels, points) if anchor is not None else ()
+    fixed_functions = {name: conserved_by_name[name] for name in names}
+    target_values = None if anchor is None else evaluate_functions(tuple(fixed_functions.values()), anchor[None])[0]
+    search = _EquilibriumSearch(system, tuple(fixed_functions.values()), target_values, heat_counter_indices(system))
     scale = float(np.linalg.norm(points[0] if anchor is None else anchor)) or 1.0
     states = search.solve(points, scale)
-    members = [_equilibrium(system, x, scale) for x in _distinct(states, SAME_STATE_RTOL * scale)]
+    members = [_make_equilibrium(system, x, scale) for x in _distinct_states(states, SAME_STATE_RTOL * scale)]
     order = list(Stability)
     members.sort(key=lambda member: (order.index(member.stability), member.levels["energy"]))
     return Equilibria(tuple(members), names, len(points), len(states))
@@ -259,30 +259,33 @@ def steady_state(system: System, x0=None, t: float | None = None) -> Equilibrium
     >>> rest.stable, bool(rest.bath_heat[0] > 0.0), bool(abs(rest.bath_heat.sum()) < 1e-14)
     (True, True, True)
     """
-    system = frozen_system(system, t)
-    x = np.asarray(system.resting_guess() if x0 is None else system.state(x0))
-    conserved = conserved_functions(system, x)
-    functions = tuple(conserved.values())
-    search = _Search(system, functions, values_of(functions, x[None])[0], counter_components(system))
+    system = freeze_system(system, t)
+    x = np.asarray(system.steady_state_guess() if x0 is None else system.state(x0))
+    conserved_by_name = conserved_functions(system, x)
+    functions = tuple(conserved_by_name.values())
+    search = _EquilibriumSearch(
+        system, functions, evaluate_functions(functions, x[None])[0], heat_counter_indices(system)
+    )
     scale = float(np.linalg.norm(x)) or 1.0
-    states = search.solve(search.follow_transient(x, scale)[None], scale)
+    states = search.solve(search.follow_transient_to_rest(x, scale)[None], scale)
     if not len(states):
         raise ConvergenceError(
             f"the motion of this {system.kind} from x0 does not come to rest: it may oscillate, grow, or have no "
             "steady state. Give another x0, or look for unstable ones with lt.equilibria(system)",
             None,
         )
-    return _equilibrium(system, states[0], scale)
+    return _make_equilibrium(system, states[0], scale)
 
 
-def _equilibrium(system: System, x: np.ndarray, scale: float) -> Equilibrium:
-    derivatives, functions = derivatives_at(system, x)
+def _make_equilibrium(system: System, x: np.ndarray, scale: float) -> Equilibrium:
+    """Return the :class:`Equilibrium` at a state at rest, with the linear motion near it."""
+    derivatives, functions = field_derivatives_and_invariants(system, x)
     linearisation = linearise_at(system, x, derivatives, functions, scale)
     velocity = derivatives.velocity.copy()
-    velocity[counter_components(system)] = 0.0
+    velocity[heat_counter_indices(system)] = 0.0
     norm = float(np.linalg.norm(derivatives.jacobian))
     levels = dict(zip(functions, derivatives.values.tolist(), strict=True))
-    levels["energy"] = float(values_of((system.energy,), x[None])[0, 0])
+    levels["energy"] = float(evaluate_functions((system.energy,), x[None])[0, 0])
     m = system.dim - system.body_dim
     heat = np.zeros(m)
     if m:
@@ -291,123 +294,132 @@ def _equilibrium(system: System, x: np.ndarray, scale: float) -> Equilibrium:
     return Equilibrium(x, residual, levels, linearisation, heat)
 
 
-def _starting_points(system: System, anchor: np.ndarray | None, starts, count: int, seed: int) -> np.ndarray:
+def _starting_points(system: System, reference: np.ndarray | None, starts, count: int, seed: int) -> np.ndarray:
+    """Return the starting points of a search, shape (points, n): those of the user, or random ones."""
     if starts is not None:
         return np.atleast_2d(np.asarray(system.state(starts, batch=True)))
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise InputError(f"count must be a positive number of starting points, got {count!r}")
-    size = 1.0 if anchor is None else float(np.linalg.norm(anchor)) / np.sqrt(system.dim) or 1.0
+    size = 1.0 if reference is None else float(np.linalg.norm(reference)) / np.sqrt(system.dim) or 1.0
     points = system.samples(count, seed, size)
-    return points if anchor is None else np.concatenate([anchor[None], points])
+    return points if reference is None else np.concatenate([reference[None], points])
 
 
-def _level_names(
-    system: System, conserved: dict[str, Energy], levels: Sequence[str] | None, points: np.ndarray
+def _fixed_function_names(
+    system: System,
+    conserved_functions_by_name: dict[str, Energy],
+    requested_names: Sequence[str] | None,
+    points: np.ndarray,
 ) -> tuple[str, ...]:
-    """Return the names of the functions that are fixed on the leaf of the first of some points, shape (points, n)."""
-    if levels is None:
-        variable = set(system.momentum_maps) | (set() if _is_damped(system, points) else {"energy"})
-        return tuple(name for name in conserved if name not in variable)
-    names = (levels,) if isinstance(levels, str) else tuple(levels)
-    if unknown := [name for name in names if name not in conserved]:
-        known = joined_names(list(map(repr, conserved))) or "no function"
-        raise InputError(f"levels names {unknown[0]!r}, but this {system.kind} conserves {known}")
+    """Return the names of the functions whose values a search fixes, by default all but energy and momentum maps."""
+    if requested_names is None:
+        variable = set(system.momentum_maps) | (set() if _has_active_dissipation(system, points) else {"energy"})
+        return tuple(name for name in conserved_functions_by_name if name not in variable)
+    names = (requested_names,) if isinstance(requested_names, str) else tuple(requested_names)
+    if unknown := [name for name in names if name not in conserved_functions_by_name]:
+        known_names = abbreviate_names(list(map(repr, conserved_functions_by_name))) or "no function"
+        raise InputError(f"levels names {unknown[0]!r}, but this {system.kind} conserves {known_names}")
     return names
 
 
-def _is_damped(system: System, points: np.ndarray) -> bool:
-    """Return whether the dissipation moves some of the points, shape (points, n); with rate zero it moves none."""
+def _has_active_dissipation(system: System, points: np.ndarray) -> bool:
+    """Return whether the dissipation moves any of the points, shape (points, n)."""
     return bool(system.total_dissipation.terms) and bool(
         np.any(evaluate_at_points(_dissipative_velocity, system, points))
     )
 
 
 def _dissipative_velocity(system: System, x):
+    """Return the part of the vector field that is due to dissipation, shape (n,)."""
     return system.vector_field(x) - system.poisson.sharp(x, system.energy.gradient(x))
 
 
-def _distinct(states: np.ndarray, distance: float) -> list[np.ndarray]:
-    """Return one of each group of states that are nearer to each other than a distance."""
+def _distinct_states(states: np.ndarray, min_distance: float) -> list[np.ndarray]:
+    """Return the states, one for each group of states nearer to each other than ``min_distance``."""
     groups: list[np.ndarray] = []
     for x in states:
-        if not any(np.linalg.norm(x - y) <= distance for y in groups):
+        if not any(np.linalg.norm(x - y) <= min_distance for y in groups):
             groups.append(x)
     return groups
 
 
-class _Search(NamedTuple):
-    """The equations of an equilibrium: velocity zero, and conserved functions at given values.
+class _EquilibriumSearch(NamedTuple):
+    """A search for states with zero velocity and given values of conserved functions.
 
     Attributes
     ----------
     system : System
     functions : tuple of Energy
-    targets : array, shape (functions,), or None
-    counters : array of int
+    target_values : array, shape (functions,), or None
+    counter_indices : array of int
         Components that are not part of the equations.
     """
 
     system: System
     functions: tuple[Energy, ...]
-    targets: np.ndarray | None
-    counters: np.ndarray
+    target_values: np.ndarray | None
+    counter_indices: np.ndarray
 
-    def evaluate(self, points: np.ndarray) -> FieldDerivatives:
-        """Return velocities and functions at points, axis 0, with derivatives by the state; clock and work are left
-        out."""
+    def evaluate_derivatives(self, points: np.ndarray) -> FieldDerivatives:
+        """Return field, functions and derivatives at points, shape (points, n), with zero velocity of the counters."""
         derivatives = evaluate_at_points(field_derivatives, (self.system, self.functions), points)
         derivatives = FieldDerivatives(*(np.array(a) for a in derivatives))  # solve() overwrites rows
-        derivatives.velocity[:, self.counters], derivatives.jacobian[:, self.counters] = 0.0, 0.0
+        derivatives.velocity[:, self.counter_indices], derivatives.jacobian[:, self.counter_indices] = 0.0, 0.0
         return derivatives
 
-    def solve(self, points: np.ndarray, scale: float) -> np.ndarray:
-        """Return the equilibria reached from the points, shape (converged, n), by Levenberg-Marquardt steps."""
-        states, damping = points.copy(), np.full(len(points), 1e-3)
-        current = self.evaluate(states)
-        weights = self._row_weights(current, scale)
-        residuals, matrices = self._equations(current, weights)
+    def solve(self, starting_points: np.ndarray, scale: float) -> np.ndarray:
+        """Return the equilibria, shape (converged, n), that Levenberg-Marquardt steps reach from starting points."""
+        states, damping = starting_points.copy(), np.full(len(starting_points), 1e-3)
+        derivatives = self.evaluate_derivatives(states)
+        weights = self._equation_weights(derivatives, scale)
+        residuals, matrices = self._weighted_residuals_and_jacobians(derivatives, weights)
         costs = np.linalg.norm(residuals, axis=1)
-        rejected = np.zeros(len(points), dtype=int)
-        active = np.isfinite(costs)
+        n_rejected = np.zeros(len(starting_points), dtype=int)
+        is_active = np.isfinite(costs)
         for _ in range(MAX_ITERATIONS):
-            use = np.flatnonzero(active)
-            if not use.size:
+            active_indices = np.flatnonzero(is_active)
+            if not active_indices.size:
                 break
-            steps = scale * np.array([_damped_step(scale * matrices[i], residuals[i], damping[i]) for i in use])
-            trials = self._move(states[use], steps, current.frame[use])
-            evaluated = self.evaluate(trials)
-            new_residuals, new_matrices = self._equations(evaluated, weights)
+            steps = scale * np.array(
+                [_damped_step(scale * matrices[i], residuals[i], damping[i]) for i in active_indices]
+            )
+            trials = self._retract_steps(states[active_indices], steps, derivatives.frame[active_indices])
+            trial_derivatives = self.evaluate_derivatives(trials)
+            new_residuals, new_matrices = self._weighted_residuals_and_jacobians(trial_derivatives, weights)
             new_costs = np.linalg.norm(new_residuals, axis=1)
-            better = new_costs < costs[use]  # False for NaN
-            chosen, other = use[better], use[~better]
-            states[chosen], costs[chosen] = trials[better], new_costs[better]
-            residuals[chosen], matrices[chosen] = new_residuals[better], new_matrices[better]
-            for old, new in zip(current, evaluated, strict=True):
-                old[chosen] = new[better]
-            damping[chosen] = np.maximum(damping[chosen] * 0.1, 1e-30)
-            damping[other] *= 10.0
-            rejected[chosen], rejected[other] = 0, rejected[other] + 1
-            active[(rejected > PATIENCE) | (damping > MAX_DAMPING) | (costs == 0.0)] = False
-        accepted = np.isfinite(costs) & self._is_at_rest(current, scale) & self._is_on_leaf(current, scale)
-        accepted &= np.array([not self.system.domain.why_outside(x) for x in states], dtype=bool)
-        return states[accepted]
+            is_improved = new_costs < costs[active_indices]  # False for NaN
+            improved_indices, failed_indices = active_indices[is_improved], active_indices[~is_improved]
+            states[improved_indices], costs[improved_indices] = trials[is_improved], new_costs[is_improved]
+            residuals[improved_indices], matrices[improved_indices] = (
+                new_residuals[is_improved],
+                new_matrices[is_improved],
+            )
+            for old, new in zip(derivatives, trial_derivatives, strict=True):
+                old[improved_indices] = new[is_improved]
+            damping[improved_indices] = np.maximum(damping[improved_indices] * 0.1, 1e-30)
+            damping[failed_indices] *= 10.0
+            n_rejected[improved_indices], n_rejected[failed_indices] = 0, n_rejected[failed_indices] + 1
+            is_active[(n_rejected > PATIENCE) | (damping > MAX_DAMPING) | (costs == 0.0)] = False
+        is_accepted = np.isfinite(costs) & self._is_at_rest(derivatives, scale) & self._is_on_leaf(derivatives, scale)
+        is_accepted &= np.array([not self.system.domain.why_outside(x) for x in states], dtype=bool)
+        return states[is_accepted]
 
-    def follow_transient(self, x: np.ndarray, scale: float) -> np.ndarray:
-        """Return the state that implicit Euler steps of growing size lead to from x, shape (n,)."""
-        current = self.evaluate(x[None])
-        speed = np.linalg.norm(current.velocity)
-        norm = np.linalg.norm(current.jacobian)
+    def follow_transient_to_rest(self, x: np.ndarray, scale: float) -> np.ndarray:
+        """Return the state, shape (n,), that implicit Euler steps of growing size reach from x."""
+        derivatives = self.evaluate_derivatives(x[None])
+        speed = np.linalg.norm(derivatives.velocity)
+        norm = np.linalg.norm(derivatives.jacobian)
         step = 0.1 / norm if norm > 0.0 else 0.1 * scale / (speed or 1.0)
         for _ in range(MAX_TRANSIENT_STEPS):
-            velocity, jacobian, frame = current.velocity[0], current.jacobian[0], current.frame[0]
+            velocity, jacobian, frame = derivatives.velocity[0], derivatives.jacobian[0], derivatives.frame[0]
             if not speed > RESIDUAL_RTOL * np.linalg.norm(jacobian) * scale:
                 break
             to_coordinates = np.linalg.pinv(frame.T) if self.system.space is not None else np.eye(len(frame))
             matrix = np.eye(len(frame)) / step - to_coordinates @ jacobian
             displacement = np.linalg.lstsq(matrix, to_coordinates @ velocity, rcond=None)[0]
-            trial = self._move(x[None], displacement[None], current.frame)
-            evaluated = self.evaluate(trial)
-            new_speed = np.linalg.norm(evaluated.velocity)
+            trial = self._retract_steps(x[None], displacement[None], derivatives.frame)
+            trial_derivatives = self.evaluate_derivatives(trial)
+            new_speed = np.linalg.norm(trial_derivatives.velocity)
             if (
                 not np.isfinite(new_speed)
                 or self.system.domain.why_outside(trial[0])
@@ -416,50 +428,56 @@ class _Search(NamedTuple):
                 step *= 0.25
                 continue
             step *= float(np.clip(speed / new_speed if new_speed > 0.0 else np.inf, 0.5, STEP_GROWTH_LIMIT))
-            x, current, speed = trial[0], evaluated, new_speed
+            x, derivatives, speed = trial[0], trial_derivatives, new_speed
         return x
 
-    def _move(self, states: np.ndarray, steps: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    def _retract_steps(self, states: np.ndarray, steps: np.ndarray, frames: np.ndarray) -> np.ndarray:
+        """Return the states, shape (points, n), moved by steps in coordinates of their tangent frames."""
         displacements = np.einsum("bm,bmn->bn", steps, frames)
         if self.system.space is None:
             return states + displacements
-        moved = evaluate_at_points(_retract_pair, self.system, np.concatenate([states, displacements], axis=1))
-        return np.asarray(moved)
+        moved_states = evaluate_at_points(_retract_pair, self.system, np.concatenate([states, displacements], axis=1))
+        return np.asarray(moved_states)
 
-    def _row_weights(self, current: FieldDerivatives, scale: float) -> np.ndarray:
-        """Return factors that make velocities and functions dimensionless, shape (n + functions,)."""
-        jacobian_norm = np.nanmedian(np.linalg.norm(current.jacobian, axis=(1, 2)))
-        gradient_norms = np.nanmedian(np.linalg.norm(current.gradients, axis=2), axis=0)
-        velocity_weight = np.full(current.velocity.shape[1], 1.0 / (jacobian_norm * scale or 1.0))
+    def _equation_weights(self, derivatives: FieldDerivatives, scale: float) -> np.ndarray:
+        """Return factors, shape (n + functions,), that make the equations of velocity and functions dimensionless."""
+        jacobian_norm = np.nanmedian(np.linalg.norm(derivatives.jacobian, axis=(1, 2)))
+        gradient_norms = np.nanmedian(np.linalg.norm(derivatives.gradients, axis=2), axis=0)
+        velocity_weight = np.full(derivatives.velocity.shape[1], 1.0 / (jacobian_norm * scale or 1.0))
         return np.concatenate([velocity_weight, 1.0 / np.where(gradient_norms > 0.0, gradient_norms * scale, 1.0)])
 
-    def _equations(self, current: FieldDerivatives, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals, shape (points, equations), and their derivatives, shape (points, equations, m)."""
-        if self.targets is None:
-            weights = weights[: current.velocity.shape[1]]
-            return current.velocity * weights, current.jacobian * weights[:, None]
-        residuals = np.concatenate([current.velocity, current.values - self.targets], axis=1)
-        matrices = np.concatenate([current.jacobian, current.gradients], axis=1)
+    def _weighted_residuals_and_jacobians(
+        self, derivatives: FieldDerivatives, weights: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return weighted residuals, shape (points, equations), and Jacobians, shape (points, equations, m)."""
+        if self.target_values is None:
+            weights = weights[: derivatives.velocity.shape[1]]
+            return derivatives.velocity * weights, derivatives.jacobian * weights[:, None]
+        residuals = np.concatenate([derivatives.velocity, derivatives.values - self.target_values], axis=1)
+        matrices = np.concatenate([derivatives.jacobian, derivatives.gradients], axis=1)
         return residuals * weights, matrices * weights[:, None]
 
-    def _is_at_rest(self, current: FieldDerivatives, scale: float) -> np.ndarray:
-        norms = np.linalg.norm(current.jacobian, axis=(1, 2))
-        return np.linalg.norm(current.velocity, axis=1) <= RESIDUAL_RTOL * norms * scale
+    def _is_at_rest(self, derivatives: FieldDerivatives, scale: float) -> np.ndarray:
+        """Return for each point whether the velocity is negligible there: bools, shape (points,)."""
+        norms = np.linalg.norm(derivatives.jacobian, axis=(1, 2))
+        return np.linalg.norm(derivatives.velocity, axis=1) <= RESIDUAL_RTOL * norms * scale
 
-    def _is_on_leaf(self, current: FieldDerivatives, scale: float) -> np.ndarray:
-        if self.targets is None or not self.functions:
-            return np.ones(len(current.velocity), dtype=bool)
-        sizes = np.linalg.norm(current.gradients, axis=2) * scale + np.abs(self.targets)
-        return (np.abs(current.values - self.targets) <= LEVEL_RTOL * sizes).all(axis=1)
+    def _is_on_leaf(self, derivatives: FieldDerivatives, scale: float) -> np.ndarray:
+        """Return for each point whether the functions have their target values there: bools, shape (points,)."""
+        if self.target_values is None or not self.functions:
+            return np.ones(len(derivatives.velocity), dtype=bool)
+        sizes = np.linalg.norm(derivatives.gradients, axis=2) * scale + np.abs(self.target_values)
+        return (np.abs(derivatives.values - self.target_values) <= LEVEL_RTOL * sizes).all(axis=1)
 
 
 def _damped_step(matrix: np.ndarray, residual: np.ndarray, damping: float) -> np.ndarray:
-    """Return the Levenberg-Marquardt step of least norm."""
+    """Return the Levenberg-Marquardt step, shape (m,), of linear equations with a damping."""
     rows = np.concatenate([matrix, np.sqrt(damping) * np.eye(matrix.shape[1])])
     right_side = np.concatenate([-residual, np.zeros(matrix.shape[1])])
     return np.linalg.lstsq(rows, right_side, rcond=None)[0]
 
 
 def _retract_pair(system: System, state_and_displacement) -> jax.Array:
+    """Return the state moved by a displacement; both are given in one array, shape (2n,)."""
     n = system.dim
     return retract(system, state_and_displacement[:n], state_and_displacement[n:])

@@ -37,7 +37,7 @@ _SINGULAR_MESSAGE = (
 
 
 class Legendre(Energy):
-    """The Hamiltonian ``H(mu) = <mu, xi> - l(xi)`` at the xi with ``dl/dxi = mu``.
+    """The Hamiltonian of a Lagrangian l(xi), ``H(mu) = <mu, xi> - l(xi)`` at the xi with ``dl/dxi = mu``.
 
     Its gradient is xi(mu). The equation is solved by damped Newton, and differentiated as an implicit function.
 
@@ -49,7 +49,7 @@ class Legendre(Energy):
     lagrangian: Energy
 
     def velocity(self, mu) -> jax.Array:
-        """Return the velocity xi with ``dl/dxi = mu``, shape (n,); NaN where Newton's method finds none."""
+        """Return the velocity xi, shape (n,), at which ``dl/dxi`` is mu; NaN if Newton's method does not converge."""
         return inverse_gradient(self.lagrangian, jnp.asarray(mu))
 
     def momentum(self, xi) -> jax.Array:
@@ -65,10 +65,11 @@ class Legendre(Energy):
 
 
 class EulerPoincareSystem(LiePoissonSystem):
-    """Forced Euler-Poincaré equations ``d/dt dl/dxi = ad*_xi (dl/dxi + F(xi))`` [BFM 3.2, 3.4], in mu = dl/dxi.
+    """A system of forced Euler-Poincaré equations [BFM 3.2, 3.4] in the momentum ``mu = dl/dxi``.
 
-    The state is mu; ``system.velocity(mu)`` gives xi and ``system.momentum(xi)`` the way back. A quadratic Lagrangian
-    given as ``lt.Quadratic`` is transformed in closed form.
+    The equations are ``d/dt dl/dxi = ad*_xi (dl/dxi + F(xi))``. The state is mu; ``system.velocity(mu)`` gives
+    xi, and ``system.momentum(xi)`` gives mu. A quadratic Lagrangian given as ``lt.Quadratic`` is transformed in closed
+    form.
 
     Parameters
     ----------
@@ -108,8 +109,8 @@ class EulerPoincareSystem(LiePoissonSystem):
         )
 
     @property
-    def hints(self) -> EngineHints:
-        return super().hints._replace(can_unroll=isinstance(self.energy, Quadratic))  # the others iterate
+    def engine_hints(self) -> EngineHints:
+        return super().engine_hints._replace(can_unroll=isinstance(self.energy, Quadratic))  # the others iterate
 
     def at_time(self, t, attitude=None) -> EulerPoincareSystem:
         system = super().at_time(t, attitude)
@@ -131,15 +132,17 @@ class EulerPoincareSystem(LiePoissonSystem):
 
 
 def _velocity_at(system: EulerPoincareSystem, mu) -> jax.Array:
+    """Return the velocity ``dH/dmu`` at one momentum, shape (n,)."""
     return system.energy.gradient(mu)
 
 
 def _momentum_at(system: EulerPoincareSystem, xi) -> jax.Array:
+    """Return the momentum ``dl/dxi`` at one velocity, shape (n,)."""
     return system.lagrangian.gradient(xi)
 
 
 class _TimedLegendre(Module):
-    """The Hamiltonian of a Lagrangian ``l(xi, t)``, a function of mu and t."""
+    """The Hamiltonian of a Lagrangian ``l(xi, t)`` as a function of mu and t."""
 
     lagrangian: Energy
 
@@ -148,6 +151,7 @@ class _TimedLegendre(Module):
 
 
 def _legendre_hamiltonian(lagrangian: Energy, dim: int) -> Energy:
+    """Return the Hamiltonian of a Lagrangian on an algebra, in closed form if the Lagrangian is quadratic."""
     if lagrangian.depends_on_time:
         _require_regular(lagrangian.at_time(0.0), dim)
         return TimeDependent(_TimedLegendre(lagrangian))
@@ -168,16 +172,18 @@ def _legendre_hamiltonian(lagrangian: Energy, dim: int) -> Energy:
 
 
 def _require_regular(lagrangian: Energy, dim: int) -> None:
+    """Raise InputError if the Hessian of the Lagrangian is singular at four random velocities."""
     points = np.random.default_rng(0).standard_normal((4, dim))
     require_regular(_lagrangian_hessian, lagrangian, points, _SINGULAR_MESSAGE)
 
 
 def _lagrangian_hessian(lagrangian: Energy, xi) -> jax.Array:
+    """Return the Hessian of a Lagrangian at a velocity, shape (n, n)."""
     return jax.hessian(lagrangian.value)(xi)
 
 
 def require_regular(hessian: Callable, model, points: np.ndarray, message: str) -> None:
-    """Raise InputError if the matrices ``hessian(model, point)`` are all finite and all singular.
+    """Raise InputError if the matrices ``hessian(model, point)`` at all points are finite and singular.
 
     Nothing is tested while JAX traces the model.
     """
@@ -265,7 +271,7 @@ class EulerPoincareClosedSystem(LedgerSystem):
         message = "the Lagrangian is singular: its Hessian in xi has no inverse"
         require_regular(_hessian, structure, np.random.default_rng(0).standard_normal((4, n + 1)), message)
         energy = with_polynomial_degrees(ReducedEnergy(lagrangian), n + 1)
-        self._assemble(structure, n + 1, energy, forces, momentum_maps, validate)
+        self._build_with_ledger(structure, n + 1, energy, forces, momentum_maps, validate)
 
     def state(
         self,
@@ -277,7 +283,7 @@ class EulerPoincareClosedSystem(LedgerSystem):
         temperature=None,
         degrees: bool = False,
     ) -> jax.Array:
-        """Return a state of this system: ``x``, checked, or the state with a given angular velocity and temperature.
+        """Return ``x`` as a checked state, or the state with a given angular velocity and temperature.
 
         Parameters
         ----------
@@ -315,16 +321,17 @@ class EulerPoincareClosedSystem(LedgerSystem):
         return super().state(jnp.concatenate([xi, S], axis=-1), batch)
 
     def _entropy_at_temperature(self, xi, temperature) -> jax.Array:
-        """Return the entropy, shape (1,), at which ``-l_S`` is a temperature."""
+        """Return the entropy S, shape (1,), at which the temperature ``-l_S`` has a given value."""
         energy = Function(lambda y: -self.lagrangian(xi, y[0]))
         return inverse_gradient(energy, jnp.reshape(temperature, 1))
 
     def momentum(self, xi, S) -> jax.Array:
-        """Return the momentum ``l_xi`` at one point, shape (dim,)."""
+        """Return the momentum ``l_xi`` of the body at one velocity xi and entropy S, shape (dim,)."""
         return jax.grad(self.lagrangian)(xi, S)
 
     def momentum_jacobians(self, x) -> tuple[jax.Array, jax.Array]:
-        return cast(VelocityLiePoisson, self.structure).momentum_derivatives(x[: self.dim_without_ledger])[1:]
+        structure = cast(VelocityLiePoisson, self.poisson_without_ledger)
+        return structure.momentum_and_derivatives(x[: self.dim_without_ledger])[1:]
 
     @property
     def motion_quantities(self) -> MotionQuantities:
@@ -335,16 +342,16 @@ class EulerPoincareClosedSystem(LedgerSystem):
         return -jax.grad(self.lagrangian, argnums=1)(y[:-1], y[-1])
 
     def momenta(self, x) -> jax.Array:
-        """Return the momenta ``l_xi``, shape (..., dim), at states, shape (..., n)."""
+        """Return the momenta ``l_xi`` of the body, shape (..., dim), at states, shape (..., n)."""
         momentum = jnp.vectorize(lambda y: self.momentum(y[:-1], y[-1]), signature="(n)->(m)")
-        return momentum(self.drop_ledger(x))
+        return momentum(self.states_without_ledger(x))
 
     def casimirs(self) -> dict[str, Energy]:
         return self.momentum_casimirs
 
 
 class MomentumFunction(Module):
-    """A function of the state, from a function of the momentum ``l_xi``."""
+    """A function of the state (xi, S), computed from a function of the momentum ``l_xi``."""
 
     energy: Energy
     lagrangian: Callable
@@ -354,7 +361,7 @@ class MomentumFunction(Module):
 
 
 class ReducedEnergy(Energy):
-    """The energy ``xi . l_xi - l``."""
+    """The energy of a body as a function of the state (xi, S): ``xi . l_xi - l``."""
 
     lagrangian: Callable
 
@@ -364,7 +371,7 @@ class ReducedEnergy(Energy):
 
 
 class VelocityLiePoisson(PoissonBySharp):
-    """The Lie-Poisson structure on g* x R in the chart ``(xi, S) -> (l_xi, S)``; S is a Casimir function."""
+    """The Lie-Poisson structure on g* x R in coordinates (xi, S) with ``mu = l_xi``; S is a Casimir function."""
 
     algebra: mf.LieAlgebra
     lagrangian: Callable
@@ -373,17 +380,18 @@ class VelocityLiePoisson(PoissonBySharp):
     def dim(self) -> int:
         return self.algebra.dim + 1
 
-    def momentum_derivatives(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return ``mu = l_xi`` and its derivatives with respect to xi and S."""
+    def momentum_and_derivatives(self, x) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return the momentum ``l_xi`` and its derivatives by xi and S, shapes (n,), (n, n) and (n,)."""
         momentum = jax.grad(self.lagrangian)
         xi_derivative, S_derivative = jax.jacfwd(momentum, argnums=(0, 1))(x[:-1], x[-1])
         return momentum(x[:-1], x[-1]), xi_derivative, S_derivative
 
     def sharp(self, x, alpha) -> jax.Array:
-        mu, W, _ = self.momentum_derivatives(x)
+        mu, W, _ = self.momentum_and_derivatives(x)
         xi = solve(W, alpha[:-1, None])[:, 0]
         return jnp.append(solve(W, self.algebra.ad_star(xi, mu)[:, None])[:, 0], 0.0)
 
 
 def _hessian(structure: VelocityLiePoisson, x):
-    return structure.momentum_derivatives(x)[1]
+    """Return the Hessian of the Lagrangian in the velocity at a state, shape (n, n)."""
+    return structure.momentum_and_derivatives(x)[1]

@@ -24,10 +24,10 @@ from .states import evaluate_batch
 
 
 class LiouvilleFriction(SkewFriction):
-    """The thermodynamic part of an evolution field, ``{., H}_Delta`` of the single-generator form [SML 6, 30].
+    """The friction of an evolution field, proportional to the temperature, and the heat it makes [SML 6, 30].
 
-    On T*Q x R it is ``p' = -p H_S, S' = p . H_p``: friction proportional to the temperature H_S, and the heat it makes.
-    It is a skew bracket with H, so H is conserved. The entropy cannot fall where ``Delta H >= 0`` [SML Prop. 4.3]; this
+    On T*Q x R it is ``p' = -p H_S, S' = p . H_p``, the bracket ``{., H}_Delta`` of the single-generator form. It is
+    skew with H, so H is conserved. The entropy cannot fall where ``Delta H >= 0`` [SML Prop. 4.3]; this
     is known of ``H = p . G(q) p / 2 + V(q, S)`` given in terms of that form, and then holds in a discretisation too.
     """
 
@@ -36,7 +36,10 @@ class LiouvilleFriction(SkewFriction):
 
 
 class ReebDrift(LiouvilleFriction):
-    """Drift that turns an evolution field into the contact field ``X_H = E_H - H R``, ``H' = -R(H) H`` [SML §2.2]."""
+    """The force that turns an evolution field into the contact field ``X_H = E_H - H R`` [SML §2.2].
+
+    The energy then changes by ``H' = -R(H) H``.
+    """
 
     energy_law = None
 
@@ -52,17 +55,17 @@ class ContactManifoldSystem(System):
     is_isolated: ClassVar[bool] = True
     """True for the evolution field, which conserves the energy; False for the contact field."""
 
-    def _build_field(self, structure, dim, energy, function: Energy, momentum_maps, validate, space) -> None:
-        """Build the evolution or the contact field of an energy; ``function`` determines it, on a space Q or R^n."""
+    def _build_field(self, structure, dim, energy, mechanics: Energy, momentum_maps, validate, space) -> None:
+        """Build the evolution or contact field of an energy; ``mechanics`` is the Hamiltonian or Lagrangian."""
         entropy: Energy | None = None
         friction: LiouvilleFriction = ReebDrift()
         if self.is_isolated:
-            law = nondecreasing_law_if(is_kinetic_plus_potential(function, dim, space))
+            law = nondecreasing_law_if(is_kinetic_plus_potential(mechanics, dim, space))
             entropy, friction = entropy_component(dim), LiouvilleFriction(law=law)
-        parts = structure, dim, energy, entropy, friction, momentum_maps, validate
-        self._build(*parts, state_space(space), check_poisson=space is None)
+        arguments = structure, dim, energy, entropy, friction, momentum_maps, validate
+        self._build(*arguments, state_space(space), check_poisson=space is None)
 
-    def specific_residuals(self, x) -> dict[str, jax.Array]:
+    def specific_axiom_residuals(self, x) -> dict[str, jax.Array]:
         rate = self.vector_field(x)
         if self.is_isolated:  # the first law: the field lies in the kernel of the contact form [SML Remark 4.2]
             form = self.contact.form(x)
@@ -74,7 +77,7 @@ class ContactManifoldSystem(System):
 
     @property
     def contact(self) -> mf.SplitContact:
-        """The contact structure."""
+        """The contact structure of the states."""
         return self.poisson.contact
 
     @property
@@ -92,7 +95,7 @@ class ContactManifoldSystem(System):
 
 
 class MomentumContactSystem(ContactManifoldSystem):
-    """Base class of contact systems of an energy, with states (q, p, S)."""
+    """Base class of contact systems that an energy determines, with states (q, p, S)."""
 
     def __init__(
         self,
@@ -110,7 +113,7 @@ class MomentumContactSystem(ContactManifoldSystem):
 
 
 class EvolutionSystem(MomentumContactSystem):
-    """The evolution field of an energy on T*Q x R: an isolated system with friction [SML 7, §4].
+    """An isolated system with friction: the evolution field of an energy on T*Q x R [SML 7, §4].
 
     ``q' = H_p, p' = -H_q - p H_S, S' = p . H_p``, with the temperature ``T = H_S``. The energy is constant and the path
     is tangent to the kernel of ``eta = dS - p dq``, which is the first law. The second holds where
@@ -153,7 +156,7 @@ class EvolutionSystem(MomentumContactSystem):
 
     __init__ = MomentumContactSystem.__init__  # said here for type checkers, which would make one of the fields
 
-    production_name: ClassVar[str] = "Delta_Q H"
+    entropy_production_name: ClassVar[str] = "Delta_Q H"
 
     def temperature(self, x, t=None) -> jax.Array:
         """Return the temperature ``T = H_S`` of states, shape (...), at the time t if the energy depends on it."""
@@ -165,11 +168,12 @@ class EvolutionSystem(MomentumContactSystem):
 
 
 def _temperature_at(system: EvolutionSystem, x) -> jax.Array:
+    """Return the temperature at one state, shape ()."""
     return system.energy.gradient(x)[-1]
 
 
 class ContactSystem(MomentumContactSystem):
-    """The plain contact field X_H of an energy on T*Q x R, for comparison [SML §2.2].
+    """A system with the contact field X_H of an energy on T*Q x R, for comparison [SML §2.2].
 
     ``q' = H_p, p' = -H_q - p H_S, S' = p . H_p - H``. It describes no isolated system: ``H' = -H_S H``, and S is the
     action. The metriplectic midpoint scheme keeps that law in the form ``H(x') - H(x) = -h (dgrad H)_S H(z)``.
@@ -189,7 +193,7 @@ class ContactSystem(MomentumContactSystem):
 
 
 def canonical_structure(dim: int, space: mf.Space | None = None) -> mf.Cosymplectic:
-    """Return the contact structure of T*Q x R, on dim = 2n + 1 coordinates."""
+    """Return the Poisson structure with the contact form ``dS - p dq`` on states (q, p, S), dim = 2n + 1."""
     return mf.Cosymplectic(mf.CanonicalContact(n_degrees_of_freedom(dim), bundle=tangent_bundle_of(space)))
 
 
@@ -214,7 +218,7 @@ def configuration_space(contact: mf.SplitContact) -> mf.Space | None:
     return contact.bundle.base if isinstance(contact.bundle, mf.TangentBundle) else None
 
 
-def check_space(space) -> mf.Space:
+def checked_space(space) -> mf.Space:
     """Return the space of positions, or raise an InputError if it is not a space."""
     if not isinstance(space, mf.Space):
         raise InputError(f"space must be a manifolds.Space, such as mf.Sphere(2), got {type(space).__name__}")
@@ -222,16 +226,16 @@ def check_space(space) -> mf.Space:
 
 
 def state_dim(dim: int | None, space: mf.Space | None) -> int:
-    """Return the number of components of (q, p, S)."""
+    """Return the number of components of a state (q, p, S), from dim or from the space of q."""
     if space is None:
         return 2 * n_degrees_of_freedom(dim) + 1
-    if dim not in (None, n := 2 * check_space(space).size + 1):
+    if dim not in (None, n := 2 * checked_space(space).size + 1):
         raise InputError(f"on {space.name} a state (q, p, S) must have {n} components, got dim={dim}. Leave dim out")
     return n
 
 
 class JoinedArguments(Module):
-    """A function of one array (and more arguments), from a function of (q, p, S) or (q, v, S), q of a given shape."""
+    """A function of a state in one array, computed from a function of (q, p, S) or (q, v, S)."""
 
     function: Callable
     shape: tuple[int, ...] | None = eqx.field(static=True)
@@ -243,14 +247,14 @@ class JoinedArguments(Module):
 
 
 def join_arguments(function, space: mf.Space | None = None):
-    """Return a function of one array from a function of (q, p, S); anything else is returned unchanged."""
+    """Return a function of (q, p, S) as a function of the state in one array; anything else unchanged."""
     if not callable(function) or isinstance(function, Energy) or required_argument_count(function) != 3:
         return function
-    return JoinedArguments(function, None if space is None else check_space(space).shape)
+    return JoinedArguments(function, None if space is None else checked_space(space).shape)
 
 
 def n_degrees_of_freedom(dim: int | None) -> int:
-    """Return n for a state with dim = 2n + 1 components (q, p, S)."""
+    """Return the number n of degrees of freedom of a state (q, p, S) with dim = 2n + 1 components."""
     if isinstance(dim, bool) or not isinstance(dim, int) or dim < 3 or dim % 2 == 0:
         raise InputError(
             f"dim, the number of components of (q, p, S), must be 2n + 1 for n degrees of freedom, got {dim!r}"
@@ -259,9 +263,10 @@ def n_degrees_of_freedom(dim: int | None) -> int:
 
 
 def entropy_component(dim: int, indices=-1) -> Energy:
-    """Return the entropy that is the last component of a state, or the sum of components with given indices."""
+    """Return the entropy as a function of the state: its last component, or the sum of components."""
     return Quadratic(jnp.zeros(dim), jnp.zeros(dim).at[indices].set(1.0))
 
 
 def _relative_residual(residual, size):
+    """Return the absolute value of a residual over a size; the absolute value itself if the size is zero."""
     return jnp.abs(residual) / jnp.where(size > 0.0, size, 1.0)

@@ -36,10 +36,10 @@ from .baths import HeatBaths
 from .invariants import TEST_TIMES
 
 
-def hamiltonian_energy(hamiltonian, times=None) -> tuple[int, Energy]:
-    """Return the number of levels of a Hamiltonian, and the energy ``tr(rho H)`` as a function of coordinates."""
+def make_hamiltonian_energy(hamiltonian, times=None) -> tuple[int, Energy]:
+    """Return the number of levels of a Hamiltonian and its energy ``tr(rho H)`` as a function of the state."""
     if isinstance(hamiltonian, list | tuple) and any(map(_is_hamiltonian_term, hamiltonian)):
-        return _energy_of_terms(hamiltonian, times)
+        return _energy_of_hamiltonian_terms(hamiltonian, times)
     if callable(hamiltonian) and not isinstance(hamiltonian, HasMatrix):
         if isinstance(_value_at_time(hamiltonian, TEST_TIMES[0], "the Hamiltonian"), HasMatrix):
             raise InputError(
@@ -65,7 +65,7 @@ def hamiltonian_energy(hamiltonian, times=None) -> tuple[int, Energy]:
 
 
 def _value_at_time(function, t: float, what: str):
-    """Return the value of a function of time at t.
+    """Return the value of a function of time at the time t.
 
     Raises
     ------
@@ -88,13 +88,13 @@ def _is_hamiltonian_term(term) -> bool:
     return isinstance(term, HasMatrix) or np.ndim(term) == 2
 
 
-def _energy_of_terms(terms: Sequence, times) -> tuple[int, Energy]:
-    """Return the number of levels of a Hamiltonian ``H0 + f(t) H1 + ...`` and its energy as a function of the state.
+def _energy_of_hamiltonian_terms(terms: Sequence, times) -> tuple[int, Energy]:
+    """Return the number of levels of a Hamiltonian given as ``[H0, (H1, f), ...]``, and its energy ``tr(rho H)``.
 
     The terms are given as ``[H0, (H1, f), ...]``.
     """
-    constant: list[np.ndarray] = []
-    modulated: list[np.ndarray] = []
+    constant_matrices: list[np.ndarray] = []
+    modulated_matrices: list[np.ndarray] = []
     functions = []
     for i, term in enumerate(terms):
         is_pair = isinstance(term, list | tuple) and len(term) == 2 and _is_hamiltonian_term(term[0])
@@ -103,26 +103,26 @@ def _energy_of_terms(terms: Sequence, times) -> tuple[int, Energy]:
         if isinstance(H, list | tuple) and H and _is_hamiltonian_term(H[0]):
             raise InputError(f"term {i} of the Hamiltonian must be a matrix, or a pair of a matrix and a function of t")
         H = checked_hermitian(H, f"term {i} of the Hamiltonian")
-        if H.shape != (first_matrix := (constant + modulated + [H])[0]).shape:
+        if H.shape != (first_matrix := (constant_matrices + modulated_matrices + [H])[0]).shape:
             raise InputError(
                 f"term {i} of the Hamiltonian has shape {H.shape}, but another term has shape {first_matrix.shape}"
             )
         if f is None:
-            constant.append(H)
+            constant_matrices.append(H)
             continue
         value = _value_at_time(f, TEST_TIMES[0], f"the second of term {i} of the Hamiltonian")
         if np.shape(value) or jnp.result_type(value).kind not in "fiu":
             raise InputError(f"the function of term {i} of the Hamiltonian must return a real number, got {value!r}")
-        modulated.append(H)
+        modulated_matrices.append(H)
         functions.append(f)
     if times is not None and not any(isinstance(f, ContinuedSpline) for f in functions):
         raise InputError("times= belongs to coefficients that are arrays, and the Hamiltonian has none. Remove times=")
     structure = mf.DensityMatrices(len(H))
     with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
-        matrices = (sum(constant, np.zeros_like(H)), *modulated)
+        matrices = (sum(constant_matrices, np.zeros_like(H)), *modulated_matrices)
         static, *rows = (jnp.asarray(structure.vector(a)) for a in matrices)
         reference = jnp.asarray(lower_level_of_smallest_gap(np.asarray(static)[: structure.size]))
-    if not modulated:
+    if not modulated_matrices:
         return structure.size, MeanEnergy(static, reference)
     initial = static
     for f, row in zip(functions, rows, strict=True):
@@ -131,21 +131,21 @@ def _energy_of_terms(terms: Sequence, times) -> tuple[int, Energy]:
     return structure.size, TimeDependent(ModulatedExpectationValue(static, tuple(rows), tuple(functions), lowest))
 
 
-def _coefficient_function(coefficient, times, i: int) -> Callable:
-    """Return a function of time that interpolates the values of a coefficient at ``times``."""
+def _coefficient_function(coefficient, times, term_index: int) -> Callable:
+    """Return a spline of time through the values of a coefficient at ``times``."""
     if isinstance(coefficient, str):
         raise InputError(
-            f"the coefficient of term {i} of the Hamiltonian is the string {coefficient!r}, which is not evaluated. "
-            "Give a function of t, such as lambda t: jnp.cos(t)"
+            f"the coefficient of term {term_index} of the Hamiltonian is the string {coefficient!r}, which is not "
+            "evaluated. Give a function of t, such as lambda t: jnp.cos(t)"
         )
     values = np.asarray(coefficient)
     if values.dtype.kind not in "fiu" or values.ndim != 1:
         raise InputError(
-            f"term {i} of the Hamiltonian must be a matrix, or a pair of a matrix and a function of t or an array of "
-            f"real numbers, got a second entry of type {type(coefficient).__name__}"
+            f"term {term_index} of the Hamiltonian must be a matrix, or a pair of a matrix and a function of t or an "
+            f"array of real numbers, got a second entry of type {type(coefficient).__name__}"
         )
     if times is None:
-        raise InputError(f"the coefficient of term {i} of the Hamiltonian is an array, so it needs times=")
+        raise InputError(f"the coefficient of term {term_index} of the Hamiltonian is an array, so it needs times=")
     knots = np.asarray(times, dtype=np.float64)
     if knots.shape != values.shape or knots.size < 4 or not (np.diff(knots) > 0.0).all():
         raise InputError(
@@ -159,7 +159,7 @@ DENSITY_MATRIX_TOLERANCE = 1e-12
 """Largest difference of a trace from one, and of a density matrix from its adjoint, that is accepted as input."""
 
 
-def checked_density_matrices(rho: np.ndarray, size: int, mixed: float) -> np.ndarray:
+def checked_density_matrices(rho: np.ndarray, size: int, mixing_weight: float) -> np.ndarray:
     """Return checked density matrices, shape (..., N, N), from matrices, kets, a bra or a stacked operator.
 
     Raises
@@ -176,7 +176,7 @@ def checked_density_matrices(rho: np.ndarray, size: int, mixed: float) -> np.nda
     if size > 1 and rho.shape == (size**2, 1):  # an operator as QuTiP stacks it, by columns
         rho = rho.reshape(size, size).T
     if rho.shape == (size,) or (size > 1 and rho.shape[-2:] == (size, 1)):
-        rho = _density_of_kets(rho[:, None] if rho.ndim == 1 else rho)
+        rho = _density_matrices_of_kets(rho[:, None] if rho.ndim == 1 else rho)
     if rho.shape[-2:] != (size, size):
         raise InputError(
             f"a density matrix of this system must have shape ({size}, {size}), got {rho.shape}; a ket has the shape "
@@ -192,23 +192,25 @@ def checked_density_matrices(rho: np.ndarray, size: int, mixed: float) -> np.nda
     min_eigenvalue = float(np.linalg.eigvalsh(rho)[..., 0].min())
     if min_eigenvalue < -NEGATIVE_EIGENVALUE_LIMIT:
         raise InputError(f"the density matrix must be positive, but its least eigenvalue is {min_eigenvalue:.3g}")
-    if not isinstance(mixed, int | float | np.number) or not 0.0 <= mixed <= 1.0:
-        raise InputError(f"mixed, the weight of the maximally mixed state, must be a number from 0 to 1, got {mixed!r}")
-    return (1.0 - mixed) * rho + mixed * np.eye(size) / size
+    if not isinstance(mixing_weight, int | float | np.number) or not 0.0 <= mixing_weight <= 1.0:
+        raise InputError(
+            f"mixed, the weight of the maximally mixed state, must be a number from 0 to 1, got {mixing_weight!r}"
+        )
+    return (1.0 - mixing_weight) * rho + mixing_weight * np.eye(size) / size
 
 
-def _density_of_kets(ket: np.ndarray) -> np.ndarray:
+def _density_matrices_of_kets(kets: np.ndarray) -> np.ndarray:
     """Return the density matrices, shape (..., N, N), of pure states, shape (..., N, 1)."""
-    norms = np.linalg.norm(ket, axis=-2)
+    norms = np.linalg.norm(kets, axis=-2)
     wrong_norm = float(norms.ravel()[np.argmax(np.abs(norms - 1.0))])
     if abs(wrong_norm - 1.0) > DENSITY_MATRIX_TOLERANCE:
         raise InputError(f"the ket must have norm 1, got {wrong_norm:.15g}. Divide the ket by its norm")
-    ket = ket / norms[..., None]
-    return ket @ adjoint(ket)
+    kets = kets / norms[..., None]
+    return kets @ adjoint(kets)
 
 
-def checked_parts(parts, names, size: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Return the dimensions and the names of the parts of a composite quantum system, checked."""
+def checked_factor_dims_and_names(parts, names, size: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Return the checked dimensions and names of the factors of a composite quantum system."""
     parts = (size,) if parts is None else tuple(int(n) for n in parts)
     if math.prod(parts) != size or min(parts) < 1:
         raise InputError(f"the product of the sizes of the parts must be {size}, got the sizes {parts}")
@@ -218,22 +220,23 @@ def checked_parts(parts, names, size: int) -> tuple[tuple[int, ...], tuple[str, 
     return parts, names
 
 
-def tensor_with_identity(matrix: np.ndarray, k: int, sizes: Sequence[int]) -> np.ndarray:
-    """Return an operator of the k-th of two systems as an operator of their product."""
-    return np.kron(matrix, np.eye(sizes[1])) if k == 0 else np.kron(np.eye(sizes[0]), matrix)
+def tensor_with_identity(matrix: np.ndarray, factor_index: int, factor_dims: Sequence[int]) -> np.ndarray:
+    """Return the tensor product of an operator of one of two systems with the identity of the other."""
+    return np.kron(matrix, np.eye(factor_dims[1])) if factor_index == 0 else np.kron(np.eye(factor_dims[0]), matrix)
 
 
-def join_baths(a: HeatBaths, b: HeatBaths) -> HeatBaths:
-    """Return the baths of a product of two systems, those of the first one first."""
-    if not a.number or not b.number:
-        return a if a.number else b
+def join_baths(first_baths: HeatBaths, second_baths: HeatBaths) -> HeatBaths:
+    """Return the baths of two systems together, those of the first system first."""
+    if not first_baths.number or not second_baths.number:
+        return first_baths if first_baths.number else second_baths
     kinds = BathEnergy | ReservoirEnergy
-    if not isinstance(a.energy, kinds) or not isinstance(b.energy, kinds):
+    if not isinstance(first_baths.energy, kinds) or not isinstance(second_baths.energy, kinds):
         raise InputError("baths of a product have constant capacities: build the product with baths of its own")
     capacity, temperature = (
-        jnp.concatenate([getattr(a.energy, name), getattr(b.energy, name)]) for name in ("capacity", "temperature")
+        jnp.concatenate([getattr(first_baths.energy, name), getattr(second_baths.energy, name)])
+        for name in ("capacity", "temperature")
     )
-    return HeatBaths(capacity, temperature, a.number + b.number)
+    return HeatBaths(capacity, temperature, first_baths.number + second_baths.number)
 
 
 class RotatingFrame(metaclass=ListedType):
@@ -286,7 +289,7 @@ class RotatingFrame(metaclass=ListedType):
         hamiltonian, times
             As of :class:`QuantumSystem`.
         """
-        size, energy = hamiltonian_energy(hamiltonian, times)
+        size, energy = make_hamiltonian_energy(hamiltonian, times)
         self._check_size((size, size), "the Hamiltonian")
         return _FrameHamiltonian(energy, jnp.asarray(self.levels), Operator(self.vectors))
 
@@ -322,13 +325,16 @@ class RotatingFrame(metaclass=ListedType):
             if abs(omega + frequency) <= tolerance:
                 resonant += 0.5 * np.exp(-1j * phase) * component
         if D.any() and not resonant.any():
-            found = ", ".join(f"{omega:.6g}" for omega in self.components(D) if omega >= 0.0)
+            frequency_text = ", ".join(f"{omega:.6g}" for omega in self.components(D) if omega >= 0.0)
             raise InputError(
-                f"no part of the drive is at rest in the frame: its frequencies there are {found}, and that of the "
-                f"drive is {frequency:.6g}. Give the frame a generator whose level distances contain that frequency"
+                f"no part of the drive is at rest in the frame: its frequencies there are {frequency_text}, and that "
+                f"of the drive is {frequency:.6g}. Give the frame a generator whose level distances contain that "
+                "frequency"
             )
-        at_rest = self.components(H)
-        static = sum((V for omega, V in at_rest.items() if abs(omega) <= self._tolerance), np.zeros_like(H))
+        components_of_constant = self.components(H)
+        static = sum(
+            (V for omega, V in components_of_constant.items() if abs(omega) <= self._tolerance), np.zeros_like(H)
+        )
         H = static - self.generator + resonant
         return (H + adjoint(H)) / 2
 
@@ -353,7 +359,7 @@ class RotatingFrame(metaclass=ListedType):
         return parts
 
     def jumps(self, couplings: Sequence[tuple[Any, Any]]) -> LindbladJumps:
-        """Return :class:`LindbladJumps` in the frame, for operators that only get a phase there.
+        """Return :class:`LindbladJumps` in the frame, for jump operators that only get a phase there.
 
         Parameters
         ----------
@@ -379,7 +385,7 @@ class RotatingFrame(metaclass=ListedType):
         return jumps
 
     def to_frame(self, matrix, t) -> np.ndarray:
-        """Return density matrices or observables in the frame.
+        """Return density matrices or observables of the laboratory as they are in the frame, shape (..., N, N).
 
         Parameters
         ----------
@@ -391,7 +397,7 @@ class RotatingFrame(metaclass=ListedType):
         return U @ np.asarray(matrix) @ adjoint(U)
 
     def to_laboratory(self, matrix, t) -> np.ndarray:
-        """Return density matrices or observables of the frame as the laboratory sees them.
+        """Return density matrices or observables of the frame as they are in the laboratory, shape (..., N, N).
 
         Parameters
         ----------
@@ -403,7 +409,7 @@ class RotatingFrame(metaclass=ListedType):
         return adjoint(U) @ np.asarray(matrix) @ U
 
     def _rotation(self, t) -> np.ndarray:
-        """Return ``exp(i G t)``, shape (..., N, N)."""
+        """Return the rotation ``exp(i G t)`` of the frame, shape (..., N, N)."""
         phases = np.exp(1j * np.asarray(t, dtype=np.float64)[..., None] * self.levels)
         return (self.vectors * phases[..., None, :]) @ adjoint(self.vectors)
 
@@ -418,7 +424,7 @@ class RotatingFrame(metaclass=ListedType):
 
 
 class _FrameHamiltonian(Module):
-    """The Hamiltonian in a rotating frame, as a function of time."""
+    """A Hamiltonian in a rotating frame as a function of time, with values of shape (N, N)."""
 
     energy: Energy
     levels: jax.Array
@@ -429,5 +435,5 @@ class _FrameHamiltonian(Module):
         energy, origin = self.energy.at_time(t), jnp.zeros(structure.dim)
         H = structure.matrix(energy.gradient(origin)) + energy.value(origin) * np.eye(structure.size)
         phases, U = jnp.exp(1j * t * self.levels), np.asarray(self.vectors)
-        turned = phases[:, None] * (adjoint(U) @ H @ U) * phases.conj() - jnp.diag(self.levels)
-        return U @ turned @ adjoint(U)
+        rotated = phases[:, None] * (adjoint(U) @ H @ U) * phases.conj() - jnp.diag(self.levels)
+        return U @ rotated @ adjoint(U)

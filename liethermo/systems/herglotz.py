@@ -39,19 +39,19 @@ SINGULAR_LAGRANGIAN_MESSAGE = (
 
 
 class VelocityContactSystem(ContactManifoldSystem):
-    """Base class of contact systems of a Lagrangian, with states (q, v, S)."""
+    """Base class of contact systems that a Lagrangian determines, with states (q, v, S)."""
 
     lagrangian: Energy
 
     @property
     def contact(self) -> mf.LagrangianContact:
-        """The contact structure ``eta_L = dS - L_v dq`` [SML §3.1]."""
+        """The contact structure of the Lagrangian, with the form ``dS - L_v dq`` [SML §3.1]."""
         return cast(mf.LagrangianContact, self.poisson.contact)
 
     def _build_contact_structure(
         self, lagrangian, dim: int | None, space: mf.Space | None = None
     ) -> tuple[mf.Cosymplectic, int, Energy]:
-        """Check a Lagrangian, and return its Poisson structure, the dimension and the energy E_L."""
+        """Return the Poisson structure, the dimension and the energy of a Lagrangian after checking it."""
         L = make_energy(lagrangian, "the Lagrangian")
         if dim is None and space is None and isinstance(L, Quadratic):
             dim = L.A.shape[0]
@@ -61,10 +61,11 @@ class VelocityContactSystem(ContactManifoldSystem):
         n = n_degrees_of_freedom(dim)
         self.lagrangian = L = with_polynomial_degrees(checked_energy(L, dim, "the Lagrangian"), dim)
         contact = mf.LagrangianContact(_EnergyValue(L), n, tangent_bundle_of(space))
-        require_regular(_hessian, contact, random_states(contact, 4), SINGULAR_LAGRANGIAN_MESSAGE)
+        require_regular(_hessian, contact, random_velocity_states(contact, 4), SINGULAR_LAGRANGIAN_MESSAGE)
         return mf.Cosymplectic(contact), dim, _lagrangian_energy(L, dim)
 
     def _hamiltonian(self) -> Energy:
+        """Return the Hamiltonian as a function of (q, p, S); InputError if q is not in R^n."""
         if self.configurations is not None:
             raise InputError(
                 f"the Legendre transform is inverted on R^n alone, and positions are in {self.configurations.name}. "
@@ -73,12 +74,12 @@ class VelocityContactSystem(ContactManifoldSystem):
         return _legendre_hamiltonian(self.lagrangian, self.dim)
 
     def legendre(self, x) -> jax.Array:
-        """Return ``FL(q, v, S) = (q, L_v, S)``, states of :meth:`hamiltonian_system`, shape (..., dim)."""
+        """Return states (q, L_v, S) of :meth:`hamiltonian_system` from states (q, v, S), shape (..., dim)."""
         return jnp.vectorize(self.contact.legendre, signature="(n)->(n)")(self.state(x, batch=True))
 
 
 class LagrangianSystem(VelocityContactSystem):
-    """A system that a Lagrangian determines, without other forces."""
+    """Base class of systems that a Lagrangian determines without further forces."""
 
     def __init__(
         self,
@@ -93,7 +94,7 @@ class LagrangianSystem(VelocityContactSystem):
 
 
 class ThermodynamicHerglotz(LagrangianSystem):
-    """Thermodynamic Herglotz equations: the evolution field of a Lagrangian L(q, v, S) [SML 12].
+    """An isolated system with the evolution field of a Lagrangian L(q, v, S), Herglotz' equations [SML 12].
 
     ``d/dt L_v - L_q = L_v L_S`` and ``S' = v . L_v``, in the state (q, v, S). It is the field ``Gamma_L`` of
     ``eta_L = dS - L_v dq`` and of the energy ``E_L = v . L_v - L``, which it conserves; its Legendre transform is the
@@ -125,15 +126,15 @@ class ThermodynamicHerglotz(LagrangianSystem):
 
     __init__ = LagrangianSystem.__init__  # said here for type checkers, which would make one of the fields
 
-    production_name: ClassVar[str] = "Delta(L)"
+    entropy_production_name: ClassVar[str] = "Delta(L)"
 
     def hamiltonian_system(self) -> EvolutionSystem:
-        """Return the system on T*Q x R with states (q, p, S); positions must be in R^n."""
+        """Return the evolution system with states (q, p, S) of the Legendre transform; q must be in R^n."""
         return EvolutionSystem(self._hamiltonian(), self.dim, validate=False)
 
 
 class Herglotz(LagrangianSystem):
-    """Herglotz' equations of 1930, the contact field of a Lagrangian, for comparison [SML 10].
+    """A system with the contact field of a Lagrangian, Herglotz' equations of 1930, for comparison [SML 10].
 
     ``d/dt L_v - L_q = L_v L_S`` and ``S' = L``, in the state (q, v, S): S is the action, and ``E_L' = L_S E_L``.
 
@@ -148,7 +149,7 @@ class Herglotz(LagrangianSystem):
     is_isolated: ClassVar[bool] = False
 
     def hamiltonian_system(self) -> ContactSystem:
-        """Return the system on T*Q x R with states (q, p, S); positions must be in R^n."""
+        """Return the contact system with states (q, p, S) of the Legendre transform; q must be in R^n."""
         return ContactSystem(self._hamiltonian(), self.dim, validate=False)
 
 
@@ -156,13 +157,14 @@ class Herglotz(LagrangianSystem):
 
 
 def _lagrangian_energy(L: Energy, dim: int) -> Energy:
-    """Return ``E_L = v . L_v - L``, term by term, so that discretisations know the form of each term."""
+    """Return the energy ``v . L_v - L`` of a Lagrangian, term by term, so that methods know the form of each."""
     points = np.random.default_rng(0).standard_normal((4, dim))
     terms = [_energy_of_term(term, points) for term in L.terms]
     return sum(terms[1:], terms[0])
 
 
 def _energy_of_term(term: Energy, points: np.ndarray) -> Energy:
+    """Return the energy ``v . L_v - L`` of one term of a Lagrangian."""
     if isinstance(term, Kinetic):
         return term
     if isinstance(term, Quadratic):
@@ -171,7 +173,7 @@ def _energy_of_term(term: Energy, points: np.ndarray) -> Energy:
 
 
 def _energy_of_quadratic(L: Quadratic) -> Quadratic:
-    """Return E_L of a quadratic Lagrangian: terms of degree k in v are multiplied by k - 1."""
+    """Return the energy of a quadratic Lagrangian, in which terms of degree k in v are multiplied by k - 1."""
     dim = L.A.shape[0]
     degree = (np.arange(dim) // (dim // 2) == 1).astype(float)
     factor = 2.0 * degree - 1.0 if L.A.ndim == 1 else np.add.outer(degree, degree) - 1.0
@@ -179,7 +181,7 @@ def _energy_of_quadratic(L: Quadratic) -> Quadratic:
 
 
 class _LegendreEnergy(Energy):
-    """The energy ``v . L_v - L`` of any term of a Lagrangian."""
+    """The energy ``v . L_v - L`` of a Lagrangian as a function of (q, v, S)."""
 
     lagrangian: Energy
 
@@ -189,7 +191,7 @@ class _LegendreEnergy(Energy):
 
 
 class _EnergyValue(Module):
-    """The value of an energy, as a callable module."""
+    """A callable module that returns the value of an energy at a state."""
 
     energy: Energy
 
@@ -201,7 +203,7 @@ class _EnergyValue(Module):
 
 
 def _legendre_hamiltonian(L: Energy, dim: int) -> Energy:
-    """Return ``H = E_L o FL^-1``, in closed form for quadratic Lagrangians and for kinetic minus potential energy."""
+    """Return the Hamiltonian of a Lagrangian, in closed form for quadratic and kinetic minus potential ones."""
     if isinstance(L, Quadratic):
         return _hamiltonian_of_quadratic(L)
     points = np.random.default_rng(0).standard_normal((4, dim))
@@ -213,7 +215,10 @@ def _legendre_hamiltonian(L: Energy, dim: int) -> Energy:
 
 @jit_cached
 def _hamiltonian_of_quadratic(L: Quadratic) -> Quadratic:
-    """Return ``H = (p - B r - c) . W^-1 (p - B r - c) / 2 - L(r)``, r = (q, S), where ``L_v = W v + B r + c``."""
+    """Return the Hamiltonian of a quadratic Lagrangian with ``L_v = W v + B r + c``, where r = (q, S).
+
+    It is ``H = (p - B r - c) . W^-1 (p - B r - c) / 2 - L(r)``.
+    """
     dim = L.A.shape[0]
     v, r = np.split(np.roll(np.arange(dim), -(dim // 2)), [dim // 2])
     A, b = jnp.diag(L.A) if L.A.ndim == 1 else L.A, jnp.zeros(dim) if L.b is None else L.b
@@ -226,6 +231,8 @@ def _hamiltonian_of_quadratic(L: Quadratic) -> Quadratic:
 
 
 class _InverseMetric(Module):
+    """The inverse of a metric as a function of q."""
+
     metric: Callable
 
     def __call__(self, q):
@@ -234,6 +241,7 @@ class _InverseMetric(Module):
 
 
 def _inverse_metric(G):
+    """Return the inverse of a metric: of a matrix, of the diagonal of one, or of a function of q."""
     if callable(G):
         return _InverseMetric(G)
     if G.ndim == 1:
@@ -243,12 +251,12 @@ def _inverse_metric(G):
 
 
 class LegendreTransform(Energy):
-    """The Hamiltonian ``H(q, p, S) = p . v - L(q, v, S)`` with ``L_v = p``, by damped Newton; else NaN."""
+    """The Hamiltonian ``p . v - L(q, v, S)`` at the v with ``L_v = p``, which damped Newton steps find; else NaN."""
 
     lagrangian: Energy
 
     def velocity(self, x) -> jax.Array:
-        """Return the velocity v at (q, p, S), shape (n,)."""
+        """Return the velocity v, shape (n,), that belongs to the momentum in a state (q, p, S)."""
         n = len(x) // 2
         return inverse_gradient(_VelocityLagrangian(self.lagrangian, x[:n], x[2 * n :]), x[n : 2 * n])
 
@@ -262,7 +270,7 @@ class LegendreTransform(Energy):
 
 
 class _VelocityLagrangian(Energy):
-    """A Lagrangian at fixed q and S."""
+    """A Lagrangian as a function of v, with q and S fixed."""
 
     lagrangian: Energy
     q: jax.Array
@@ -272,8 +280,8 @@ class _VelocityLagrangian(Energy):
         return self.lagrangian.value(jnp.concatenate([self.q, x, self.S]))
 
 
-def random_states(contact: mf.SplitContact, count: int) -> np.ndarray:
-    """Return random states (q, v, S), shape (count, dim), with (q, v) in the tangent bundle if there is one."""
+def random_velocity_states(contact: mf.SplitContact, count: int) -> np.ndarray:
+    """Return random states (q, v, S), shape (count, dim); (q, v) is in the tangent bundle if there is one."""
     points = np.random.default_rng(0).standard_normal((count, contact.dim))
     if isinstance(contact.bundle, mf.TangentBundle):
         bundle = contact.bundle
@@ -282,4 +290,5 @@ def random_states(contact: mf.SplitContact, count: int) -> np.ndarray:
 
 
 def _hessian(contact: mf.LagrangianContact, x):
+    """Return the Hessian ``L_vv`` at a state (q, v, S), shape (n, n)."""
     return contact.hessian(x)

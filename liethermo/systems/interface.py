@@ -33,16 +33,15 @@ class InvariantVerdicts(NamedTuple):
     undecided_names: frozenset[str]
 
     @classmethod
-    def from_verdicts(cls, verdicts: Mapping[str, bool | None], declared: Iterable[str]) -> InvariantVerdicts:
-        """Build from the verdicts, one for each function; a declared function counts as conserved unless its verdict
-        is False."""
-        verdicts = {**verdicts, **{name: True for name in declared if verdicts.get(name, True) is None}}
+    def from_verdicts(cls, verdicts: Mapping[str, bool | None], declared_names: Iterable[str]) -> InvariantVerdicts:
+        """Return the verdicts by names; a declared function counts as conserved unless its verdict is False."""
+        verdicts = {**verdicts, **{name: True for name in declared_names if verdicts.get(name, True) is None}}
         constant = {name for name, verdict in verdicts.items() if verdict}
         return cls(frozenset(constant), frozenset(name for name, verdict in verdicts.items() if verdict is None))
 
 
 class OrbitLevels(NamedTuple):
-    """Common levels of Casimirs that are the orbits of a group.
+    """Names of the Casimirs whose common levels are the orbits of a group on the momenta.
 
     Attributes
     ----------
@@ -79,7 +78,7 @@ class MotionQuantities(NamedTuple):
 
 
 class WrappedSystem(NamedTuple):
-    """The system that another one wraps for a run, and how.
+    """The system that another system wraps for a run, with the function that wraps it.
 
     Attributes
     ----------
@@ -103,7 +102,7 @@ MISSING_GROUP_MESSAGE = (
 
 
 class SparseNewton(NamedTuple):
-    """Functions of a system for Newton's method with a sparse Jacobian; by default no pattern is known.
+    """Functions that Newton's method with a sparse Jacobian needs; by default no sparsity pattern is known.
 
     Attributes
     ----------
@@ -119,7 +118,7 @@ class SparseNewton(NamedTuple):
 
 
 class EngineHints(NamedTuple):
-    """Properties of a system on which an engine and a check may rely.
+    """Properties of a system that engines and checks may rely on.
 
     Attributes
     ----------
@@ -145,7 +144,7 @@ class EngineHints(NamedTuple):
 
 @dataclass(frozen=True)
 class TorqueLaws:
-    """Name of the torque from outside that acts on a system, and its effects; by default no torque acts.
+    """Name and effects of the external torque on a system; by default no torque acts.
 
     Attributes
     ----------
@@ -185,12 +184,26 @@ REPLACED_MEMBERS = {
     "sparsity_pattern": "sparse_newton",
     "residual_weights": "sparse_newton",
     "velocity_functions": "motion_quantities",
+    "hints": "engine_hints",
+    "preserved": "preserved_functions",
+    "component_scales": "slope_scales",
+    "constant_names": "vector_invariant_names",
+    "casimir_components": "casimir_terms",
+    "resting_guess": "steady_state_guess",
+    "specific_residuals": "specific_axiom_residuals",
+    "production_name": "entropy_production_name",
+    "freeze_at": "cache_tensors_at",
+    "surface": "constraint_surface",
+    "solve_at_spins": "solve_slopes_at_each_spin",
+    "transport": "transport_covector",
+    "energy_of_vectors": "energy_of_flat_states",
+    "inner": "inner_system",
 }
 """Names of members that kinds of systems used to override, and of those that replace them."""
 
 
 class SystemInterface(Geometry):
-    """Data of a kind of system, and methods that a subclass may override.
+    """Base class with the data of a system and the methods that a kind of system may override.
 
     :class:`System` derives everything else from them, and documents the attributes.
     """
@@ -210,7 +223,7 @@ class SystemInterface(Geometry):
     """Functions that the system conserves, if they were determined near the states of a run."""
     baths: HeatBaths = eqx.field(kw_only=True, default=ABSENT_BATHS)
     """Baths that take the heat of the dissipation, if any; their entropies are the last components of a state."""
-    production_name: ClassVar[str] = "dS/dt"
+    entropy_production_name: ClassVar[str] = "dS/dt"
 
     @property
     def kind(self) -> str:
@@ -219,7 +232,7 @@ class SystemInterface(Geometry):
 
     @property
     def body_dim(self) -> int:
-        """Number of state components, those of baths left out."""
+        """Number of state components without the entropies of baths."""
         return self.dim - self.baths.number
 
     @property
@@ -232,18 +245,18 @@ class SystemInterface(Geometry):
 
     @property
     def motion_quantities(self) -> MotionQuantities:
-        """Velocities and joints of rigid bodies in the system; empty for other systems."""
+        """Functions that compute velocities of rigid bodies from a state; empty for systems without bodies."""
         return MotionQuantities()
 
     @property
-    def inner(self) -> SystemInterface | None:
-        """The inner system, whose state is the first part of a state and whose laws hold here too; None without one."""
+    def inner_system(self) -> SystemInterface | None:
+        """The system whose state is the first part of a state of this one, with the same laws; None without one."""
         return None
 
     # -- dynamics -----------------------------------------------------------------------------------------------------
 
     def field(self, x, dH, dS, dL=()) -> jax.Array:
-        """Return the vector field at x for given gradients, continuous or discrete, shape (n,).
+        """Return the vector field at x, shape (n,), for given gradients, continuous or discrete.
 
         It is ``Pi(x) dH + force(x; dH, dS, dL)``. dS is None if the system has no entropy. This is the one definition
         of the dynamics; integrators differ in the gradients that they pass.
@@ -256,27 +269,29 @@ class SystemInterface(Geometry):
         return None if self.entropy is None else self.entropy.gradient(x)
 
     def samples(self, count: int, seed: int = 0, scale: float = 1.0) -> np.ndarray:
-        """Return random states, shape (count, n): normal with standard deviation ``scale``, or points of the space."""
+        """Return random states, shape (count, n): points of the space, or normal numbers times ``scale``."""
         if self.space is None:
             states = scale * np.random.default_rng(seed).standard_normal((count, self.dim))
         else:
             states = np.array(self.space.to_vector(self.space.random(seed, (count,))))
-        states[..., self.body_dim :] *= min(1.0, 1.0 / scale) * self.baths.scale  # keeps temperatures finite
+        states[..., self.body_dim :] *= (
+            min(1.0, 1.0 / scale) * self.baths.constant_entropy_scales
+        )  # keeps temperatures finite
         return states
 
-    def resting_guess(self) -> np.ndarray:
-        """Return a state from which a steady state is looked for, shape (n,): a random one, baths at entropy zero."""
+    def steady_state_guess(self) -> np.ndarray:
+        """Return the default start of a search for a steady state, shape (n,): random, with bath entropies zero."""
         x = np.array(self.samples(1)[0])
         x[self.body_dim :] = 0.0
         return x
 
     @property
     def domain(self) -> Domain:
-        """Conditions that a state must satisfy beside finite components, with functions that explain them."""
+        """Conditions that a state must satisfy besides being finite, with functions that explain violations."""
         return Domain()
 
     def run_conditions(self, x: np.ndarray, t: np.ndarray, guarantees: frozenset[str]) -> tuple[RunCondition, ...]:
-        """Return conditions of a run beside its laws, such as positive density matrices, for the rows of an audit.
+        """Return conditions on a run besides its laws, such as positive density matrices, for the rows of an audit.
 
         Parameters
         ----------
@@ -289,19 +304,19 @@ class SystemInterface(Geometry):
         """
         return ()
 
-    def specific_residuals(self, x) -> dict[str, jax.Array]:
-        """Return residuals at x, by name, of axioms of this kind of system alone, relative to the terms that cancel."""
+    def specific_axiom_residuals(self, x) -> dict[str, jax.Array]:
+        """Return the residuals at x, by name, of axioms that only this kind of system has, relative to their terms."""
         return {}
 
     # -- what acts from outside ---------------------------------------------------------------------------------------
 
     @property
     def is_driven(self) -> bool:
-        """True if the energy depends on time, or a torque acts, so that work is done from outside."""
+        """True if work is done from outside: the energy depends on time, or a torque acts."""
         return self.energy.depends_on_time
 
     def at_time(self, t, attitude=None) -> Self:
-        """Return the system with its energy and its torque frozen at the time t; itself if none depends on time.
+        """Return the system with its energy and torque frozen at the time t; unchanged if nothing depends on time.
 
         A torque may need an attitude too, shape (m, m).
         """
@@ -310,7 +325,7 @@ class SystemInterface(Geometry):
 
     @property
     def torque_laws(self) -> TorqueLaws:
-        """Name of the torque from outside, and what it does to the momenta, the Casimirs and the entropy."""
+        """Name of the external torque, and its effects on momenta, Casimirs and entropy."""
         return TORQUE_FREE_LAWS
 
     def external_torque(self, x) -> jax.Array | None:
@@ -318,7 +333,7 @@ class SystemInterface(Geometry):
         return None
 
     def external_velocity(self, x, dH) -> jax.Array | None:
-        """Return the velocity that acts from outside, shape (n,), with temperatures from the gradient dH, shape (n,).
+        """Return the part of the vector field that acts from outside, shape (n,), at a gradient dH; None without one.
 
         It is :meth:`external_torque` for torques, which do not depend on the gradient.
         """
@@ -330,18 +345,17 @@ class SystemInterface(Geometry):
 
     @property
     def clock(self) -> Clock | None:
-        """Components of a state that hold the time and the work, with the span of the run; None if there are none."""
+        """Indices of the time and the work in a state, with the span of the run; None if a state has no time."""
         return None
 
     # -- spins ----------------------------------------------------------------------------------------------------
 
-    def solve_at_spins(self, x, dH, dS, noise_rates, others, half_step, k) -> jax.Array | None:
-        """Return the slopes of a step from earlier slopes k, solved at each spin in its present field; None without
-        spins.
+    def solve_slopes_at_each_spin(self, x, dH, dS, noise_rates, other_noise_velocity, half_step, k) -> jax.Array | None:
+        """Return slopes of a step, shape (n,), improved by solving the step equations spin by spin; None without spins.
 
-        A solution of ``k = v`` is kept, where v is the field plus the turn by noise plus ``others``. Each spin gets
-        ``k_i + u_i`` with ``u_i - half_step J_i u_i = v_i - k_i``, J_i the derivative of v_i by s_i at the given
-        gradient dH, and the other components get v.
+        A solution of ``k = v`` is kept, where v is the field plus the turn by noise plus ``other_noise_velocity``. Each
+        spin gets ``k_i + u_i`` with ``u_i - half_step J_i u_i = v_i - k_i``, J_i the derivative of v_i by s_i at the
+        given gradient dH, and the other components get v.
 
         Parameters
         ----------
@@ -349,7 +363,7 @@ class SystemInterface(Geometry):
             Midpoint of the step and gradients there.
         noise_rates : array, shape (sites, 3) or (1, 3)
             Angular velocities by noise (1 / time).
-        others : array, shape (n,)
+        other_noise_velocity : array, shape (n,)
             Velocity by other noise.
         half_step : array, shape ()
         k : array, shape (n,)
@@ -360,70 +374,72 @@ class SystemInterface(Geometry):
 
     @property
     def total_dissipation(self) -> Dissipation:
-        """The dissipation; of a system without dissipation a sum of no terms, which does nothing."""
+        """The dissipation of the system; a sum of no terms, which does nothing, if it has none."""
         return ABSENT_DISSIPATION if self.dissipation is None else self.dissipation
 
     @property
-    def preserved(self) -> tuple[Energy, ...]:
-        """Functions that the dissipation, or one of its summands, has to preserve beside the energy."""
+    def preserved_functions(self) -> tuple[Energy, ...]:
+        """Functions that the dissipation, or one of its summands, has to preserve besides the energy."""
         return self.total_dissipation.preserve
+
+    preserved = property(lambda self: self.preserved_functions, doc="The functions of :attr:`preserved_functions`.")
 
     @property
     def energy_law(self) -> LawName | None:
-        """ "conserved", "nonincreasing" under double-bracket dissipation, or None where there is no guarantee."""
+        """Law of the energy under the dissipation: "conserved", "nonincreasing", or None without a guarantee."""
         return self.total_dissipation.energy_law
 
     @property
     def entropy_law(self) -> LawName | None:
-        """ "nondecreasing", "conserved", or None where there is no entropy or no guarantee."""
+        """Law of the entropy under the dissipation: "nondecreasing", "conserved", or None without a guarantee."""
         return None if self.entropy is None else self.total_dissipation.entropy_law
 
     def casimirs(self) -> dict[str, Energy]:
         """Return the known Casimirs of the Poisson structure, by name."""
         return {}
 
-    def casimir_components(self) -> dict[str, dict[str, Energy]]:
-        """Return, by the name of a Casimir that is a sum, its terms by name, if each of them is a Casimir too."""
+    def casimir_terms(self) -> dict[str, dict[str, Energy]]:
+        """Return, by the name of each Casimir that is a sum of Casimirs, its terms by name."""
         return {}
 
     @property
     def orbit_levels(self) -> OrbitLevels:
-        """Casimirs whose common levels are the orbits of the group, and whether all Casimirs are known."""
+        """Names of the Casimirs whose common levels are the orbits of the group."""
         return OrbitLevels(self.body_dim, frozenset(self.casimirs()))
 
     @property
-    def surface(self) -> Surface | None:
-        """Surface on which every step has to end, for constraints beside conserved functions; None without any."""
+    def constraint_surface(self) -> Surface | None:
+        """Surface on which every step has to end because of constraints; None without constraints."""
         return None
 
     @property
     def ledger(self) -> dict[str, Energy]:
-        """Work and heat that the system receives from outside, recorded along a run, by name."""
+        """Functions of a state, by name, that give the work and the heat received from outside along a run."""
         return {}
 
     @property
-    def constant_names(self) -> tuple[str, ...]:
-        """Names of constants of the motion with several components, such as a momentum in space."""
+    def vector_invariant_names(self) -> tuple[str, ...]:
+        """Names of constants of the motion with several components, such as the spatial momentum."""
         return ()
 
     # -- states as users see them -------------------------------------------------------------------------------------
 
     @property
     def wrapped_system(self) -> WrappedSystem | None:
-        """The system that this one wraps for a run, with a clock, an attitude or an embedding; None without one."""
+        """The system that a run extends to this one by time, attitude or embedding; None for a system of the user."""
         return None
 
     @property
     def attitude_layout(self) -> AttitudeLayout | None:
-        """Components of a state that hold an attitude and an impulse; None if there are none."""
+        """Indices of the attitude and the impulse in a state; None if a state has no attitude."""
         return None
 
     @abstractmethod
     def state_array(self, x, batch: bool = False) -> np.ndarray | jax.Array:
-        """Return the state x, checked; several states with ``batch``."""
+        """Return x as a checked state of this system, shape (n,); several states, shape (..., n), with ``batch``."""
 
     def initial_state(self, x, t: float = 0.0, attitude=None, batch: bool = False) -> jax.Array | np.ndarray:
-        """Return the state of a run that starts at the user's state x, at the time t; several states with ``batch``.
+        """Return the state of a run that starts at the user's state x at the time t; several states with ``batch``.
 
         Raises
         ------
@@ -436,34 +452,34 @@ class SystemInterface(Geometry):
         return self.state_array(x, batch)
 
     def user_state(self, x) -> jax.Array:
-        """Return the state as the user sees it, as a point; event functions receive it."""
+        """Return the state as the user sees it, such as a point of the space; event functions receive it."""
         return self.points(x)
 
     def pullback(self, energy: Energy) -> Energy:
-        """Return a function of the states of this system from a function of the states that the user sees."""
+        """Return a function of states of this system from a function of the states that the user sees."""
         return energy
 
     @property
     def state_blocks(self) -> tuple[slice, ...]:
-        """Parts of a state that have scales of their own, such as a momentum and an attitude."""
+        """Slices of a state whose components have a common scale, such as a momentum and an attitude."""
         n = self.body_dim
         return (slice(0, n), slice(n, self.dim)) if self.baths.number else (slice(None),)
 
     # -- for the engines ----------------------------------------------------------------------------------------------
 
     @property
-    def hints(self) -> EngineHints:
-        """Return the properties that engines and checks may rely on, by default those known from the space."""
+    def engine_hints(self) -> EngineHints:
+        """Properties that engines and checks may rely on, by default those known from the space."""
         is_smooth = self.space is None or self.space.is_smooth
         is_complex = self.space is not None and self.space.dtype.kind == "c"
         return EngineHints(can_unroll=is_smooth and not is_complex, is_smooth=is_smooth)
 
     @property
     def sparse_newton(self) -> SparseNewton:
-        """Functions for Newton's method with a sparse Jacobian, which solves large systems with a known pattern."""
+        """Functions that Newton's method with a sparse Jacobian needs, for large systems with a known pattern."""
         return SparseNewton()
 
-    def component_scales(self, k) -> jax.Array:
-        """Return the scale of each component of slopes, shape (..., n), for finite differences: the largest of all."""
-        scale = jnp.max(jnp.abs(k))
-        return jnp.full_like(k, jnp.where(scale > 0.0, scale, 1.0))
+    def slope_scales(self, slopes) -> jax.Array:
+        """Return a scale for each component of slopes, shape (..., n), by default the largest absolute value of all."""
+        scale = jnp.max(jnp.abs(slopes))
+        return jnp.full_like(slopes, jnp.where(scale > 0.0, scale, 1.0))

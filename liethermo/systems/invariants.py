@@ -17,7 +17,7 @@ from manifolds._pytree_module import replace_fields
 from ..functions.energy import Energy, function_name
 from ..tracing.caching import memoize
 from ..tracing.interpret import evaluate_at_points
-from .conservation import dissipation_keeps_casimirs, is_proportional, judge_conservation, rates_of_change
+from .conservation import dissipation_keeps_casimirs, function_rates_of_change, is_proportional, judge_conservation
 from .interface import InvariantVerdicts, SystemInterface
 
 System = TypeVar("System", bound=SystemInterface)
@@ -41,52 +41,53 @@ TEST_TIMES = (0.0, 0.7310585786300049, -1.618033988749895)
 # -- names ------------------------------------------------------------------------------------------------------------
 
 
-def named_functions(system: SystemInterface) -> dict[str, Energy]:
-    """Return momentum maps, functions that the dissipation preserves, and Casimirs, by name, each quantity once."""
-    casimirs, preserved = system.casimirs(), dict[str, Energy]()
-    for name, L in zip(preserved_names(system), system.preserved, strict=True):
-        if name not in system.momentum_maps and name not in preserved:
-            preserved[name] = L
-    return system.momentum_maps | preserved | casimirs
+def candidate_invariants(system: SystemInterface) -> dict[str, Energy]:
+    """Return the functions that may be conserved, by name: momentum maps, preserved functions, Casimirs, each once."""
+    casimirs, preserved_by_name = system.casimirs(), dict[str, Energy]()
+    for name, L in zip(preserved_function_names(system), system.preserved_functions, strict=True):
+        if name not in system.momentum_maps and name not in preserved_by_name:
+            preserved_by_name[name] = L
+    return system.momentum_maps | preserved_by_name | casimirs
 
 
-def preserved_names(system: SystemInterface) -> tuple[str, ...]:
-    """Return the names of the functions ``system.preserved`` among :func:`named_functions`."""
-    return tuple(preserved_by_name(system)) if system.preserved_labels is None else system.preserved_labels
+def preserved_function_names(system: SystemInterface) -> tuple[str, ...]:
+    """Return the names of the preserved functions of a system, those of :func:`candidate_invariants`."""
+    return tuple(number_preserved_functions(system)) if system.preserved_labels is None else system.preserved_labels
 
 
-def preserved_by_name(system: SystemInterface) -> dict[str, Energy]:
-    """Return the functions ``system.preserved`` by numbered names."""
-    return {f"preserved {i + 1}": L for i, L in enumerate(system.preserved)}
+def number_preserved_functions(system: SystemInterface) -> dict[str, Energy]:
+    """Return the preserved functions of a system by the names "preserved 1", "preserved 2" and so on."""
+    return {f"preserved {i + 1}": L for i, L in enumerate(system.preserved_functions)}
 
 
-def find_preserved_names(system: SystemInterface) -> tuple[str, ...]:
-    """Return names of the preserved functions: of the map or Casimir that each is a multiple of, or new ones."""
-    functions = functions_for_naming(system)
-    gradients = evaluate_at_points(stack_gradients, functions, random_states(system, 2))  # shape (points, functions, n)
-    return names_from_multiples(system, first_multiple_indices(gradients, len(system.preserved)).tolist())
+def find_preserved_function_names(system: SystemInterface) -> tuple[str, ...]:
+    """Return a name for each preserved function: of a map or Casimir that it is a multiple of, or its own."""
+    functions = named_then_preserved_functions(system)
+    states = random_test_states(system, 2)
+    gradients = evaluate_at_points(stack_gradients, functions, states)  # shape (points, functions, n)
+    multiple_indices = first_proportional_indices(gradients, len(system.preserved_functions))
+    return name_preserved_functions(system, multiple_indices.tolist())
 
 
-def functions_for_naming(system: SystemInterface) -> tuple[Energy, ...]:
-    """Return momentum maps and Casimirs, followed by the preserved functions, which may be multiples of them."""
-    return (*(system.momentum_maps | system.casimirs()).values(), *system.preserved)
+def named_then_preserved_functions(system: SystemInterface) -> tuple[Energy, ...]:
+    """Return a tuple of the momentum maps and Casimirs of a system, followed by its preserved functions."""
+    return (*(system.momentum_maps | system.casimirs()).values(), *system.preserved_functions)
 
 
-def names_from_multiples(system: SystemInterface, multiples: Sequence[int]) -> tuple[str, ...]:
-    """Return a name for each preserved function: that of a known function of which it is a multiple, or else its
-    own.
+def name_preserved_functions(system: SystemInterface, multiple_indices: Sequence[int]) -> tuple[str, ...]:
+    """Return a name for each preserved function: that of an earlier function it is a multiple of, or its own.
 
     Parameters
     ----------
-    multiples : sequence of int
-        For each preserved function, the index in :func:`functions_for_naming` of an earlier function of which it is a
-        multiple; -1 if there is none.
+    multiple_indices : sequence of int
+        For each preserved function, the index in :func:`named_then_preserved_functions` of an earlier function of
+        which it is a multiple; -1 if there is none.
     """
-    names, reserved = list(system.momentum_maps | system.casimirs()), {"energy", "entropy"}
+    names, reserved_names = list(system.momentum_maps | system.casimirs()), {"energy", "entropy"}
     n_named = len(names)
-    for multiple, (fallback, L) in zip(multiples, preserved_by_name(system).items(), strict=True):
+    for multiple, (fallback, L) in zip(multiple_indices, number_preserved_functions(system).items(), strict=True):
         name = function_name(L)
-        usable = name.isidentifier() and name not in {*names, *reserved}
+        usable = name.isidentifier() and name not in {*names, *reserved_names}
         names.append(names[multiple] if multiple >= 0 else name if usable else fallback)
     return tuple(names[n_named:])
 
@@ -96,8 +97,8 @@ def stack_gradients(functions: tuple[Energy, ...], x) -> jax.Array:
     return jnp.stack([f.gradient(x) for f in functions])
 
 
-def first_multiple_indices(gradients: np.ndarray, count: int) -> np.ndarray:
-    """Return for each of the last ``count`` functions the first one before it of which it is a multiple, or -1.
+def first_proportional_indices(gradients: np.ndarray, n_last: int) -> np.ndarray:
+    """Return for each of the last ``n_last`` functions the first earlier one of which it is a multiple, or -1.
 
     Parameters
     ----------
@@ -105,31 +106,33 @@ def first_multiple_indices(gradients: np.ndarray, count: int) -> np.ndarray:
 
     Returns
     -------
-    array of int, shape (..., count)
+    array of int, shape (..., n_last)
     """
     total = gradients.shape[-2]
-    multiples = np.full((*gradients.shape[:-3], count), -1)
-    for k, i in enumerate(range(total - count, total)):
+    multiples = np.full((*gradients.shape[:-3], n_last), -1)
+    for k, i in enumerate(range(total - n_last, total)):
         for j in reversed(range(i)):
-            alike = is_proportional(gradients[..., i, :], gradients[..., j, :])
-            multiples[..., k] = np.where(alike, j, multiples[..., k])
+            is_multiple = is_proportional(gradients[..., i, :], gradients[..., j, :])
+            multiples[..., k] = np.where(is_multiple, j, multiples[..., k])
     return multiples
 
 
 # -- verdicts ---------------------------------------------------------------------------------------------------------
 
 
-def find_invariants(system: SystemInterface, near=None, include_declared: bool = True) -> InvariantVerdicts:
-    """Return which functions are conserved; ``include_declared`` adds preserved ones unless a test refutes them."""
+def find_invariants(system: SystemInterface, near_states=None, include_declared: bool = True) -> InvariantVerdicts:
+    """Return the names of conserved and undecided functions; ``include_declared`` adds preserved ones not refuted."""
     if system.invariant_verdicts is not None:
         return system.invariant_verdicts
-    verdicts = _memoized_verdicts(system) if near is None else _conservation_verdicts(system, near)
-    return InvariantVerdicts.from_verdicts(verdicts, preserved_names(system) if include_declared else ())
+    verdicts = (
+        _memoized_conservation_verdicts(system) if near_states is None else _conservation_verdicts(system, near_states)
+    )
+    return InvariantVerdicts.from_verdicts(verdicts, preserved_function_names(system) if include_declared else ())
 
 
 @with_library_settings
-def undecided_functions(system: SystemInterface) -> frozenset[str]:
-    """Return the names of the functions for which the test of conservation could not decide.
+def undecided_function_names(system: SystemInterface) -> frozenset[str]:
+    """Return the names of the functions of which the test could not decide whether they are conserved.
 
     The vector field could be evaluated at none of the test states, for example because the entropy is defined for few
     states.
@@ -138,33 +141,38 @@ def undecided_functions(system: SystemInterface) -> frozenset[str]:
 
 
 def resolve_invariants_near(system: System, states) -> System:
-    """Return the system with the undecided functions tested near states in its domain.
+    """Return the system with verdicts on its undecided functions, tested near given states of its domain.
 
     Parameters
     ----------
     states : array, shape (n,) or (m, n)
     """
-    if system.invariant_verdicts is not None or is_traced(system) or not undecided_functions(system):
+    if system.invariant_verdicts is not None or is_traced(system) or not undecided_function_names(system):
         return system
-    return replace_fields(system, invariant_verdicts=find_invariants(system, near=np.asarray(states)))
+    return replace_fields(system, invariant_verdicts=find_invariants(system, near_states=np.asarray(states)))
 
 
 @memoize
-def _memoized_verdicts(system: SystemInterface) -> dict[str, bool | None]:
+def _memoized_conservation_verdicts(system: SystemInterface) -> dict[str, bool | None]:
+    """Return whether each function of a system is conserved; the answer is cached by the content of the system."""
     return _conservation_verdicts(system)
 
 
-def _conservation_verdicts(system: SystemInterface, near=None) -> dict[str, bool | None]:
-    """Return whether each function is conserved, by construction or by a test; None if undecided."""
-    claimed, torque = invariants_by_construction(system), system.torque_laws
+def _conservation_verdicts(system: SystemInterface, near_states=None) -> dict[str, bool | None]:
+    """Return by name whether each function is conserved, by construction or by a test; None if undecided."""
+    claimed_names, torque = invariants_by_construction(system), system.torque_laws
     torque_free = system.casimirs().keys() - torque.changed_casimirs
-    unclaimed = {name: f for name, f in named_functions(system).items() if name not in claimed}
+    unclaimed_functions = {name: f for name, f in candidate_invariants(system).items() if name not in claimed_names}
     # a test says nothing of functions that a torque changes: the torque may be zero at the tested times only
-    testable = {name: f for name, f in unclaimed.items() if not torque.name or name in torque_free}
+    testable = {name: f for name, f in unclaimed_functions.items() if not torque.name or name in torque_free}
     with jax.ensure_compile_time_eval():  # JAX may be tracing something else
-        verdicts = [False] * len(testable) if is_traced(system) else conserves(system, tuple(testable.values()), near)
-    tested = dict(zip(testable, verdicts, strict=True))
-    return dict.fromkeys(unclaimed, False) | tested | dict.fromkeys(claimed, True)
+        verdicts = (
+            [False] * len(testable)
+            if is_traced(system)
+            else are_conserved(system, tuple(testable.values()), near_states)
+        )
+    tested_verdicts = dict(zip(testable, verdicts, strict=True))
+    return dict.fromkeys(unclaimed_functions, False) | tested_verdicts | dict.fromkeys(claimed_names, True)
 
 
 def invariants_by_construction(system: SystemInterface) -> frozenset[str]:
@@ -174,22 +182,22 @@ def invariants_by_construction(system: SystemInterface) -> frozenset[str]:
 
 
 def recorded_functions_with_verdicts(system: SystemInterface) -> dict[str, tuple[Energy, bool | None]]:
-    """Return functions to record along a run, by name, each with whether it is conserved; None if not known."""
-    if system.inner is not None:
-        inner_verdicts = recorded_functions_with_verdicts(system.inner)
-        return {name: (f.on(range(system.inner.dim)), verdict) for name, (f, verdict) in inner_verdicts.items()}
+    """Return the functions to record along a run, by name, each with whether it is conserved; None if undecided."""
+    if system.inner_system is not None:
+        inner_verdicts = recorded_functions_with_verdicts(system.inner_system)
+        return {name: (f.on(range(system.inner_system.dim)), verdict) for name, (f, verdict) in inner_verdicts.items()}
     verdicts = find_invariants(system)
     return {
         name: (function, None if name in verdicts.undecided_names else name in verdicts.conserved_names)
-        for name, function in named_functions(system).items()
+        for name, function in candidate_invariants(system).items()
     }
 
 
 # -- the test ---------------------------------------------------------------------------------------------------------
 
 
-def conserves(
-    system: SystemInterface, functions: tuple[Energy, ...], near: np.ndarray | None = None
+def are_conserved(
+    system: SystemInterface, functions: tuple[Energy, ...], near_states: np.ndarray | None = None
 ) -> list[bool | None]:
     """Return whether each function is constant along the vector field, at random states of several scales.
 
@@ -199,7 +207,7 @@ def conserves(
 
     Parameters
     ----------
-    near : array, shape (n,) or (m, n), optional
+    near_states : array, shape (n,) or (m, n), optional
         States inside the domain: states near them are tested too.
 
     Returns
@@ -209,23 +217,25 @@ def conserves(
     """
     if not functions:
         return []
-    if (inner := system.inner) is not None:
-        restricted = tuple(_InnerEnergy(f, system.dim - inner.dim) for f in functions)
-        return conserves(inner, restricted, None if near is None else near[..., : inner.dim])
+    if (inner := system.inner_system) is not None:
+        restricted_functions = tuple(_RestrictedEnergy(f, system.dim - inner.dim) for f in functions)
+        return are_conserved(
+            inner, restricted_functions, None if near_states is None else near_states[..., : inner.dim]
+        )
     if system.is_driven:
-        by_time = [conserves(frozen, functions, near) for frozen in systems_at_test_times(system)]
-        return [False if False in v else None if None in v else True for v in zip(*by_time, strict=True)]
-    points = random_states(system, n_random_states(system))
-    if near is not None:
-        points = np.concatenate([points, states_near(system, near)])
-    rates = evaluate_at_points(rates_of_change, (system, functions), points)
+        verdicts_by_time = [are_conserved(frozen, functions, near_states) for frozen in systems_at_test_times(system)]
+        return [False if False in v else None if None in v else True for v in zip(*verdicts_by_time, strict=True)]
+    points = random_test_states(system, n_test_states_per_scale(system))
+    if near_states is not None:
+        points = np.concatenate([points, states_near(system, near_states)])
+    rates = evaluate_at_points(function_rates_of_change, (system, functions), points)
     is_defined, is_conserved = judge_conservation(rates)  # shapes (points, functions)
-    by_function = zip(is_defined.T, is_conserved.T, strict=True)
-    return [bool(conserved[defined].all()) if defined.any() else None for defined, conserved in by_function]
+    flags_by_function = zip(is_defined.T, is_conserved.T, strict=True)
+    return [bool(conserved[defined].all()) if defined.any() else None for defined, conserved in flags_by_function]
 
 
-class _InnerEnergy(Energy):
-    """A function of the inner state, from a function of a longer state that depends on no more."""
+class _RestrictedEnergy(Energy):
+    """A function of the inner state, computed from a function of a longer state with zeros appended."""
 
     energy: Energy
     n_extra: int = eqx.field(static=True)
@@ -235,7 +245,7 @@ class _InnerEnergy(Energy):
 
 
 def systems_at_test_times(system: System) -> list[System]:
-    """Return the system frozen at each of :data:`TEST_TIMES`, and at a random attitude if a torque needs one."""
+    """Return the system frozen at each of :data:`TEST_TIMES`; at random attitudes too if a torque needs them."""
     if not system.torque_laws.needs_attitude:
         return [system.at_time(t) for t in TEST_TIMES]
     assert system.matrix_group is not None
@@ -243,21 +253,23 @@ def systems_at_test_times(system: System) -> list[System]:
     return [system.at_time(t, attitude) for t, attitude in zip(TEST_TIMES, attitudes, strict=True)]
 
 
-def random_states(system: SystemInterface, count: int) -> np.ndarray:
-    """Return random states at which functions are compared, ``count`` of each of :data:`TEST_STATE_SCALES`."""
-    return np.concatenate([system.samples(count, seed, scale) for seed, scale in enumerate(TEST_STATE_SCALES)])
+def random_test_states(system: SystemInterface, n_per_scale: int) -> np.ndarray:
+    """Return random states, ``n_per_scale`` of each of :data:`TEST_STATE_SCALES`, shape (scales * n_per_scale, n)."""
+    return np.concatenate([system.samples(n_per_scale, seed, scale) for seed, scale in enumerate(TEST_STATE_SCALES)])
 
 
-def n_random_states(system: SystemInterface) -> int:
-    """Return the number of random states of each scale at which conservation is tested."""
+def n_test_states_per_scale(system: SystemInterface) -> int:
+    """Return the number of random states of each scale that a test of conservation uses."""
     return 4 if system.dim <= LARGE_STATE_DIM else 1
 
 
-def states_near(system: SystemInterface, x) -> np.ndarray:
-    """Return a few of the states x, shape (m, n), and on R^n states around them at decreasing distances."""
-    x = np.reshape(np.asarray(x), (-1, system.dim))[:N_NEARBY_STATES]
+def states_near(system: SystemInterface, states) -> np.ndarray:
+    """Return some of the given states, shape (m, n), and on R^n also states around them at decreasing distances."""
+    states = np.reshape(np.asarray(states), (-1, system.dim))[:N_NEARBY_STATES]
     if system.space is not None:
-        return x
-    random = np.random.default_rng(0).standard_normal((len(NEARBY_RADII), *x.shape))
-    lengths = np.linalg.norm(x, axis=1, keepdims=True) / np.sqrt(system.dim)
-    return np.concatenate([x, *(x + radius * lengths * w for radius, w in zip(NEARBY_RADII, random, strict=True))])
+        return states
+    random = np.random.default_rng(0).standard_normal((len(NEARBY_RADII), *states.shape))
+    lengths = np.linalg.norm(states, axis=1, keepdims=True) / np.sqrt(system.dim)
+    return np.concatenate(
+        [states, *(states + radius * lengths * w for radius, w in zip(NEARBY_RADII, random, strict=True))]
+    )

@@ -10,7 +10,7 @@ from .base import System
 KindOfSystem = TypeVar("KindOfSystem", bound=System)
 
 
-def user_system(system: System) -> System:
+def unwrap_user_system(system: System) -> System:
     """Return the user's system, without the clock, the attitude and the embedding that a run adds."""
     while system.wrapped_system is not None:
         system = system.wrapped_system.system
@@ -22,12 +22,12 @@ def kind_or_class_name(value: Any) -> str:
     return value.kind if isinstance(value, System) else type(value).__name__
 
 
-def require_system(value: Any, requirement: str) -> System:
-    """Return ``value`` if it is a system.
+def require_system(value: Any, error_prefix: str) -> System:
+    """Return ``value`` if it is a system; raise InputError otherwise.
 
     Parameters
     ----------
-    requirement : str
+    error_prefix : str
         What the message of the error begins with, such as "flow needs a system".
 
     Raises
@@ -35,12 +35,12 @@ def require_system(value: Any, requirement: str) -> System:
     InputError
     """
     if not isinstance(value, System):
-        raise InputError(f"{requirement}, got {type(value).__name__}")
+        raise InputError(f"{error_prefix}, got {type(value).__name__}")
     return value
 
 
 def require_kind(system: Any, kind: type[KindOfSystem], user_name: str) -> KindOfSystem:
-    """Return the system if it is of a kind, such as QuantumSystem, that ``user_name`` needs.
+    """Return the system if it is of a kind, such as QuantumSystem, that ``user_name`` needs; InputError otherwise.
 
     Raises
     ------

@@ -28,16 +28,16 @@ SEARCH_SEEDS = (0, 1, 2, 3)
 
 
 def retract(system: System, x, v) -> jax.Array:
-    """Return ``x + v``, shape (n,), projected onto the state space."""
+    """Return the state ``x + v``, shape (n,), projected onto the state space."""
     if system.space is None:
         return x + v
     return system.space.to_vector(system.space._project(system.points(x + v)))
 
 
-def has_definite_integral(
+def has_lyapunov_function(
     system: System, x: np.ndarray, frame: np.ndarray, leaf_basis: np.ndarray, functions: dict[str, Energy]
 ) -> bool:
-    """Return whether a combination of functions is critical at x and definite on the leaf, a Lyapunov function.
+    """Return whether a combination of functions is critical at x and definite on the leaf: a Lyapunov function.
 
     The functions are the conserved ones, with any coefficients, and those that the laws let change one way only, with
     coefficients >= 0.
@@ -61,7 +61,7 @@ def has_definite_integral(
     terms = (*functions.values(), *monotone)
     if not terms:
         return False
-    gradients, hessians = (a[0] for a in evaluate_at_points(_second_order, (system, terms, frame), x[None]))
+    gradients, hessians = (a[0] for a in evaluate_at_points(_gradients_and_hessians, (system, terms, frame), x[None]))
     if not (np.isfinite(gradients).all() and np.isfinite(hessians).all()):
         return False
     variations = leaf_basis.T @ hessians @ leaf_basis
@@ -77,7 +77,7 @@ def has_definite_integral(
 
 
 def _has_definite_combination(gradients: np.ndarray, variations: np.ndarray, n_conserved: int) -> bool:
-    """Return whether a combination without a gradient, of functions with these gradients, is definite.
+    """Return whether a combination of functions exists whose gradient vanishes and whose Hessian is definite.
 
     Parameters
     ----------
@@ -89,11 +89,11 @@ def _has_definite_combination(gradients: np.ndarray, variations: np.ndarray, n_c
     _, singular_values, vectors = np.linalg.svd(gradients.T, full_matrices=True)
     rank = int(np.sum(singular_values > CRITICAL_RTOL))
     combinations = vectors[rank:]  # coefficients whose total gradient vanishes
-    return bool(len(combinations)) and _is_definite_for_some(combinations, variations, n_conserved)
+    return bool(len(combinations)) and _can_be_positive_definite(combinations, variations, n_conserved)
 
 
-def _is_definite_for_some(combinations: np.ndarray, variations: np.ndarray, n_conserved: int) -> bool:
-    """Return whether a combination of symmetric matrices is positive definite, with coefficients of the right sign.
+def _can_be_positive_definite(combinations: np.ndarray, variations: np.ndarray, n_conserved: int) -> bool:
+    """Return whether a combination of symmetric matrices, with coefficients of the right sign, is positive definite.
 
     Parameters
     ----------
@@ -124,8 +124,8 @@ def _is_definite_for_some(combinations: np.ndarray, variations: np.ndarray, n_co
     return False
 
 
-def _second_order(system_terms_frame: tuple, x) -> tuple[jax.Array, jax.Array]:
-    """Return gradients, shape (terms, m), and Hessians, shape (terms, m, m), in coordinates of the frame."""
+def _gradients_and_hessians(system_terms_frame: tuple, x) -> tuple[jax.Array, jax.Array]:
+    """Return gradients, shape (terms, m), and Hessians, shape (terms, m, m), of functions in coordinates of a frame."""
     system, terms, frame = system_terms_frame
 
     def values_near(coordinates):

@@ -20,7 +20,7 @@ from ..dissipation.base import LawName, SkewFriction
 from ..dissipation.checks import checked_semidefinite
 from ..errors import InputError
 from ..functions.checks import traced_function_and_shape
-from ..functions.conditions import checked_numbers, require_condition
+from ..functions.conditions import checked_numbers, require_condition, semidefinite_condition
 from ..functions.energy import Energy, Quadratic
 from ..functions.time_span import ConstantFunction, LastArgumentIgnored, required_argument_count
 from ..tracing.interpret import evaluate_at_points
@@ -33,7 +33,7 @@ LEDGER_DIM = 3
 
 
 class LedgerSystem(System):
-    """A closed system of a Lagrangian, in a state (q, v, S) or (xi, S), with friction, work and heat from outside.
+    """Base class of systems of a Lagrangian with friction, work and heat from outside, recorded in the state.
 
     With work or heat from outside the state has the work W and the heat Q received so far, and the time t, behind its
     own components. Its energy is then ``E - W - Q``, that of system and surroundings.
@@ -44,23 +44,23 @@ class LedgerSystem(System):
     heat_power: Callable | None
 
     def _set_forces(
-        self, friction, external, heat_power, parts: tuple[tuple[int, ...], ...], at: str
+        self, friction, external, heat_power, argument_shapes: tuple[tuple[int, ...], ...], arguments_text: str
     ) -> ForcesAndHeat | None:
-        """Check and set friction, external force and heat power, and return their dissipation, or None without any.
+        """Check and set friction, external force and heat power, and return their dissipation; None without any.
 
         Parameters
         ----------
-        parts : tuple of shapes
+        argument_shapes : tuple of shapes
             Shapes of the arguments of the functions before the time: q and v, or xi, and S.
-        at : str
+        arguments_text : str
             Name of these arguments, for messages.
         """
-        shape = parts[0]
+        shape = argument_shapes[0]
 
         def check(function, result_shape, what):
             if function is None:
                 return None
-            checked = checked_state_function(function, parts, result_shape, what, at)
+            checked = checked_state_function(function, argument_shapes, result_shape, what, arguments_text)
             return checked if len(shape) == 1 else FlattenedFunction(checked, shape)
 
         if friction is None or callable(friction):
@@ -74,30 +74,35 @@ class LedgerSystem(System):
         law: LawName = "conserved" if self.friction is None else "nondecreasing"
         return ForcesAndHeat(law=law if self.heat_power is None else None)
 
-    def _assemble(self, structure, dim: int, energy: Energy, forces, momentum_maps, validate, space=None) -> None:
-        """Build the system of a Poisson structure, dimension and energy without the ledger, which is appended."""
+    def _build_with_ledger(
+        self, structure, dim: int, energy: Energy, forces, momentum_maps, validate, space=None
+    ) -> None:
+        """Build the system from a Poisson structure and an energy of states without ledger, which is appended."""
         total_dim = dim + (LEDGER_DIM if self.has_ledger else 0)
         if self.has_ledger:
-            received = Quadratic(jnp.zeros(total_dim), jnp.zeros(total_dim).at[dim : dim + 2].set(-1.0))
-            structure, energy = ProductPoisson(structure, mf.NoPoisson(LEDGER_DIM)), energy.on(range(dim)) + received
+            negative_work_and_heat = Quadratic(jnp.zeros(total_dim), jnp.zeros(total_dim).at[dim : dim + 2].set(-1.0))
+            structure, energy = (
+                ProductPoisson(structure, mf.NoPoisson(LEDGER_DIM)),
+                energy.on(range(dim)) + negative_work_and_heat,
+            )
         entropy = entropy_component(total_dim, dim - 1)
         self._build(structure, total_dim, energy, entropy, forces, momentum_maps, validate, space)
 
     @property
-    def structure(self) -> mf.PoissonStructure:
-        """The Poisson structure without the ledger."""
+    def poisson_without_ledger(self) -> mf.PoissonStructure:
+        """The Poisson structure of states without the ledger."""
         return self.poisson.first if isinstance(self.poisson, ProductPoisson) else self.poisson
 
     # -- the state ----------------------------------------------------------------------------------------------------
 
     @property
     def has_ledger(self) -> bool:
-        """True if work or heat comes from outside, so that the state has a ledger."""
+        """True if work or heat comes from outside, so that states end with work, heat and time."""
         return self.external is not None or self.heat_power is not None
 
     @property
     def dim_without_ledger(self) -> int:
-        """Components of the state without the ledger."""
+        """Number of components of a state without the ledger."""
         return self.dim - LEDGER_DIM if self.has_ledger else self.dim
 
     @property
@@ -111,18 +116,18 @@ class LedgerSystem(System):
         return super().state_array(x, batch)
 
     def split_state(self, x) -> tuple[jax.Array, ...]:
-        """Return (q, v, S, t), or (xi, S, t), of one state; t = 0 if it has no ledger."""
-        first, S = self.first_velocity_index, self.dim_without_ledger - 1
-        positions = (x[:first],) if first else ()
-        return (*positions, x[first:S], x[S], x[-1] if len(x) > S + 1 else jnp.zeros(()))
+        """Return the parts (q, v, S, t), or (xi, S, t), of one state; t = 0 if it has no ledger."""
+        first_velocity, S = self.first_velocity_index, self.dim_without_ledger - 1
+        positions = (x[:first_velocity],) if first_velocity else ()
+        return (*positions, x[first_velocity:S], x[S], x[-1] if len(x) > S + 1 else jnp.zeros(()))
 
-    def drop_ledger(self, x) -> jax.Array:
-        """Return states without the ledger, shape (..., n)."""
+    def states_without_ledger(self, x) -> jax.Array:
+        """Return states without the components of the ledger, shape (..., n)."""
         return self.state(x, batch=True)[..., : self.dim_without_ledger]
 
-    def ledger_rates(self, work, heat) -> jax.Array:
-        """Return the rates of the ledger, shape (3,), or an empty array for an isolated system."""
-        return jnp.stack([work, heat, jnp.ones(())])[: self.dim - self.dim_without_ledger]
+    def ledger_rates(self, power, heat_power) -> jax.Array:
+        """Return the rates (power, heat power, 1) of the ledger, shape (3,); an empty array for an isolated system."""
+        return jnp.stack([power, heat_power, jnp.ones(())])[: self.dim - self.dim_without_ledger]
 
     @property
     def ledger(self) -> dict[str, Energy]:
@@ -133,52 +138,57 @@ class LedgerSystem(System):
     # -- the functions, at one point ----------------------------------------------------------------------------------
 
     def friction_force(self, *arguments) -> jax.Array:
-        """Return the friction at (q, v, S, t), or at (xi, S, t), shape (n,); t is 0 by default."""
-        return self._force(self.friction, arguments)
+        """Return the friction force, shape (n,), at the arguments (q, v, S, t) or (xi, S, t); t is 0 by default."""
+        return self._evaluate_force(self.friction, arguments)
 
     def external_force(self, *arguments) -> jax.Array:
-        """Return the external force at the arguments of :meth:`friction_force`, shape (n,)."""
-        return self._force(self.external, arguments)
+        """Return the external force, shape (n,), at the arguments (q, v, S, t) or (xi, S, t); t is 0 by default."""
+        return self._evaluate_force(self.external, arguments)
 
     def heating(self, *arguments) -> jax.Array:
-        """Return the heat power P_H at the arguments of :meth:`friction_force`."""
-        return jnp.zeros(()) if self.heat_power is None else jnp.asarray(self.heat_power(*self._with_time(arguments)))
+        """Return the heat power P_H, shape (), at the arguments (q, v, S, t) or (xi, S, t); t is 0 by default."""
+        return (
+            jnp.zeros(())
+            if self.heat_power is None
+            else jnp.asarray(self.heat_power(*self._append_default_time(arguments)))
+        )
 
-    def _force(self, function: Callable | None, arguments: tuple) -> jax.Array:
+    def _evaluate_force(self, function: Callable | None, arguments: tuple) -> jax.Array:
+        """Return the value of a force at its arguments, along the manifold of positions; zeros for None."""
         if function is None:
             return jnp.zeros_like(arguments[0])
-        return self.tangential_part(arguments[0], jnp.asarray(function(*self._with_time(arguments))))
+        return self.tangential_part(arguments[0], jnp.asarray(function(*self._append_default_time(arguments))))
 
-    def _with_time(self, arguments: tuple) -> tuple:
-        """Return the arguments of a force, with t = 0 if it is left out."""
+    def _append_default_time(self, arguments: tuple) -> tuple:
+        """Return the arguments (q, v, S, t) or (xi, S, t) of a force, with t = 0 if t is missing."""
         names = "(q, v, S, t)" if self.first_velocity_index else "(xi, S, t)"
         count = names.count(",") + 1
         if len(arguments) not in (count - 1, count):
             raise InputError(f"forces and heat are functions of {names}, but {len(arguments)} arguments were given")
         return arguments if len(arguments) == count else (*arguments, 0.0)
 
-    def friction_at(self, arguments: tuple, T) -> jax.Array:
-        """Return the friction at ``arguments``, those of :meth:`friction_force`, and at a temperature T, shape (n,)."""
+    def friction_at_temperature(self, arguments: tuple, T) -> jax.Array:
+        """Return the friction force, shape (n,), at ``arguments``, (q, v, S, t) or (xi, S, t), and a temperature T."""
         del T
         return self.friction_force(*arguments)
 
     def tangential_part(self, q, v) -> jax.Array:
-        """Return the part of a velocity or a force that is along the manifold of positions; itself without one."""
+        """Return the part of a velocity or force v tangent to the manifold of positions at q; v itself without one."""
         del q
         return v
 
     @abstractmethod
     def momentum_jacobians(self, x) -> tuple[jax.Array, jax.Array]:
-        """Return the derivatives of the momentum with respect to v and S at a state, shapes (n, n) and (n,)."""
+        """Return the derivatives of the momentum by v and S at a state, shapes (n, n) and (n,)."""
 
     @abstractmethod
     def temperature_at(self, y) -> jax.Array:
-        """Return the temperature at y, a state without ledger, shape ()."""
+        """Return the temperature, shape (), at one state y without ledger."""
 
     def temperature(self, x, t=None) -> jax.Array:
-        """Return the temperature, ``-dL/dS``, at states, shape (...); it does not depend on the time t."""
+        """Return the temperature ``-dL/dS`` at states, shape (...); it does not depend on the time t."""
         del t
-        return jnp.vectorize(self.temperature_at, signature="(n)->()")(self.drop_ledger(x))
+        return jnp.vectorize(self.temperature_at, signature="(n)->()")(self.states_without_ledger(x))
 
     def temperatures(self, x, t=None) -> jax.Array:
         """Return the temperature with an axis of length 1, shape (..., 1): see :meth:`temperature`."""
@@ -194,7 +204,7 @@ class LedgerSystem(System):
         T = float(evaluate_at_points(_temperature, self, np.atleast_2d(x)).min())
         return "" if T > 0.0 else f"the temperature -dL/dS is {T:.4g}: it has to be positive"
 
-    def specific_residuals(self, x) -> dict[str, jax.Array]:
+    def specific_axiom_residuals(self, x) -> dict[str, jax.Array]:
         arguments = self.split_state(x)
         v, force = arguments[-3], self.friction_force(*arguments)
         scale = jnp.linalg.norm(force) * jnp.linalg.norm(v)
@@ -202,11 +212,12 @@ class LedgerSystem(System):
 
 
 def _temperature(system: LedgerSystem, x):
+    """Return the temperature at one state, shape ()."""
     return system.temperature(x)
 
 
 class ForcesAndHeat(SkewFriction):
-    """Friction and the heat that it makes, an external force and a heat power, on states (…, v, S) [GBY 2.4].
+    """Friction with the heat it makes, an external force and a heat power, on states (…, v, S) [GBY 2.4].
 
     ``d/dt l_v = … + F_fr + F_ext`` and ``T S' = P_H - F_fr . v``. With the ledger W' = F_ext . v, Q' = P_H the energy
     ``v . l_v - l - W - Q`` of system and surroundings is constant, for discrete gradients too: v and T are those that
@@ -214,26 +225,28 @@ class ForcesAndHeat(SkewFriction):
     """
 
     def force(self, system, x, dH, dS, dL):
-        first, S = system.first_velocity_index, system.dim_without_ledger - 1
+        first_velocity, S = system.first_velocity_index, system.dim_without_ledger - 1
         W, S_derivative = system.momentum_jacobians(x)
-        v = solve(W, system.tangential_part(x[:first], dH[first:S])[:, None])[:, 0]
+        v = solve(W, system.tangential_part(x[:first_velocity], dH[first_velocity:S])[:, None])[:, 0]
         T = dH[S] - jnp.dot(S_derivative, v)
         *positions, _, entropy, t = system.split_state(x)
         arguments = (*positions, v, entropy, t)
-        friction, external = system.friction_at(arguments, T), system.external_force(*arguments)
+        friction, external = system.friction_at_temperature(arguments, T), system.external_force(*arguments)
         power = system.heating(*arguments)
         S_dot = (power - jnp.dot(friction, v)) / jnp.where(T > 0.0, T, jnp.nan)
         v_dot = solve(W, (friction + external - S_derivative * S_dot)[:, None])[:, 0]
-        return jnp.concatenate([jnp.zeros(first), v_dot, S_dot[None], system.ledger_rates(jnp.dot(external, v), power)])
+        return jnp.concatenate(
+            [jnp.zeros(first_velocity), v_dot, S_dot[None], system.ledger_rates(jnp.dot(external, v), power)]
+        )
 
 
 # -- friction by a coefficient -----------------------------------------------------------------------------------------
 
 
 class LinearFriction(Module):
-    """The force ``-R v`` as a function of arguments that end with (v, S, t)."""
+    """The friction force ``-R v`` as a function of arguments that end with (v, S, t)."""
 
-    R: jax.Array
+    R: jax.Array = eqx.field(metadata=semidefinite_condition("friction", symmetric=False).metadata)
 
     def __call__(self, *parts):
         v = parts[-3]
@@ -241,7 +254,7 @@ class LinearFriction(Module):
 
 
 def linear_friction(coefficient, n: int, what: str) -> LinearFriction:
-    """Return the friction ``-R v`` of a coefficient R: a number, shape (n,) for a diagonal matrix, or (n, n).
+    """Return the friction force ``-R v`` of a coefficient R: a number, shape (n,) for a diagonal matrix, or (n, n).
 
     Raises
     ------
@@ -259,40 +272,44 @@ def linear_friction(coefficient, n: int, what: str) -> LinearFriction:
 
 
 class FlattenedFunction(Module):
-    """A function of flat q and v with flat values, from a function of arrays q and v."""
+    """A function of flat q and v with a flat value, computed from a function of arrays q and v."""
 
     function: Callable
     shape: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, q, v, S, t):
-        found = jnp.asarray(self.function(q.reshape(self.shape), v.reshape(self.shape), S, t))
-        return found.ravel() if found.ndim else found
+        value = jnp.asarray(self.function(q.reshape(self.shape), v.reshape(self.shape), S, t))
+        return value.ravel() if value.ndim else value
 
 
 # -- functions of a state and the time --------------------------------------------------------------------------------
 
 
-def add_time_argument(function: Callable, n_arguments: int = 3) -> Callable:
-    """Return a function of (..., t) from a function with or without the argument t."""
-    return LastArgumentIgnored(function) if required_argument_count(function) == n_arguments else function
+def add_time_argument(function: Callable, n_arguments_without_time: int = 3) -> Callable:
+    """Return a function of (..., t), computed from one that may lack the argument t."""
+    return LastArgumentIgnored(function) if required_argument_count(function) == n_arguments_without_time else function
 
 
 def checked_state_function(
-    function, parts: tuple[tuple[int, ...], ...], shape: tuple[int, ...], what: str, at: str
+    function,
+    argument_shapes: tuple[tuple[int, ...], ...],
+    result_shape: tuple[int, ...],
+    what: str,
+    arguments_text: str,
 ) -> Callable:
-    """Return a checked function of (..., t) from a function with or without the argument t, or from a constant.
+    """Return a checked and traced function of (..., t), from one that may lack t, or from a constant.
 
     Parameters
     ----------
-    parts : tuple of shapes
+    argument_shapes : tuple of shapes
         Shapes of the arguments before t.
-    shape : tuple of int
+    result_shape : tuple of int
         Shape of the result.
-    what, at : str
+    what, arguments_text : str
         Name of the function and of its arguments, for messages.
     """
     if callable(function):
-        function = add_time_argument(function, len(parts))
+        function = add_time_argument(function, len(argument_shapes))
     else:
         function = ConstantFunction(checked_numbers(function, what))
-    return traced_function_and_shape(function, (*parts, ()), [shape], what, at)[0]
+    return traced_function_and_shape(function, (*argument_shapes, ()), [result_shape], what, arguments_text)[0]

@@ -20,7 +20,7 @@ from ..functions.energy import Energy, make_energy
 from ..tracing.caching import memoize
 from ..tracing.interpret import evaluate_at_points
 from .baths import BathEntropy, HeatBaths
-from .body_states import append_entropies, checked_velocity, is_given_by_velocity, momentum_of_velocity
+from .body_states import append_bath_entropies, checked_velocity, is_given_by_velocity, momentum_of_velocity
 from .interface import TORQUE_FREE_LAWS, MotionQuantities, OrbitLevels, TorqueLaws
 from .torque import (
     MAX_ARGUMENTS,
@@ -199,10 +199,10 @@ class LiePoissonSystem(TorqueSystem):
             return super().state(x, batch)
         velocity = checked_velocity(angular_velocity, rotor_rates, self.algebra.dim, batch, degrees)
         momentum = self.momentum_of_velocity(velocity, t)
-        return super().state(append_entropies(momentum, self.baths, temperature), batch)
+        return super().state(append_bath_entropies(momentum, self.baths, temperature), batch)
 
     def momentum_of_velocity(self, xi, t=None) -> jax.Array:
-        """Return the momentum mu with ``dH/dmu = xi``, shape (..., algebra.dim), at the time t if H depends on it."""
+        """Return the momentum mu, shape (..., algebra.dim), at which ``dH/dmu`` is xi; t is for an H(mu, t)."""
         energy = self.drop_baths().energy
         if energy.depends_on_time:
             if t is None:
@@ -213,11 +213,11 @@ class LiePoissonSystem(TorqueSystem):
     # -- the torque -----------------------------------------------------------------------------------------------
 
     def bind_attitude(self, attitude) -> LiePoissonSystem:
-        """Return the system itself: without a clock its torque, if any, is frozen at a time and an attitude."""
+        """Return the system itself, because without a clock the attitude of its torque is frozen already."""
         return self
 
     def _set_torque(self, torque) -> None:
-        """Set the fields of the torque of a system with an algebra and a group."""
+        """Set the fields of the torque; the algebra and the group must be set before."""
         self.torque, self.torque_argument_counts = traced_torque_and_argument_counts(torque, self.algebra, self.group)
         self.torque_free_components = ()
         if torque is not None:
@@ -230,13 +230,14 @@ class LiePoissonSystem(TorqueSystem):
         if self.torque is None:
             return TORQUE_FREE_LAWS
         n_momenta = self.algebra.dim if self.group is None else self.group.dim
-        free, names = self.torque_free_components, self.algebra.basis_names
+        torque_free_components, names = self.torque_free_components, self.algebra.basis_names
         takes_attitude = max(self.torque_argument_counts) > MAX_ARGUMENTS_WITHOUT_ATTITUDE
         return TorqueLaws(
             torque_name(self.torque),
-            has_impulse=not set(range(n_momenta)) <= set(free),
+            has_impulse=not set(range(n_momenta)) <= set(torque_free_components),
             needs_attitude=takes_attitude and not self.has_fixed_attitude,
-            changed_casimirs=frozenset(self.momentum_casimirs()) - _casimirs_of_components(self.algebra, names, free),
+            changed_casimirs=frozenset(self.momentum_casimirs())
+            - _names_of_casimirs_depending_only_on(self.algebra, names, torque_free_components),
         )
 
     def _torque_at(self, x, t, attitude):
@@ -259,7 +260,7 @@ class LiePoissonSystem(TorqueSystem):
         return {name: C.on(range(self.body_dim)) for name, C in casimirs.items()} if self.baths.number else casimirs
 
     def momentum_casimirs(self) -> dict[str, Energy]:
-        """Return the known Casimirs as functions of mu alone, by name."""
+        """Return the known Casimirs, by name, as functions of mu without baths."""
         return _leading_casimirs(self.algebra, self.algebra.basis_names)
 
     @property
@@ -267,12 +268,12 @@ class LiePoissonSystem(TorqueSystem):
         n_momenta, casimirs, _ = super().orbit_levels
         if self.group is not None:
             n_momenta = self.group.dim
-            casimirs = _casimirs_of_first(self.algebra, self.algebra.basis_names, n_momenta)
-        return OrbitLevels(n_momenta, casimirs, _spans_all_casimirs(self.algebra))
+            casimirs = _names_of_casimirs_depending_on_first(self.algebra, self.algebra.basis_names, n_momenta)
+        return OrbitLevels(n_momenta, casimirs, _are_all_casimirs_known(self.algebra))
 
 
 def _resolve_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str | None) -> str | None:
-    """Return the checked name of a reconstruction, by default the best one for the group; None without a group."""
+    """Return the checked name of a reconstruction, by default the best for the group; None without a group."""
     if group is None:
         if reconstruction is not None:
             raise InputError("reconstruction= needs group=, for example manifolds.SO(3)")
@@ -325,13 +326,14 @@ def _inertia_tensor(energy: Energy, dim: int) -> np.ndarray | None:
 
 
 def _gradient_and_hessian(energy: Energy, x) -> tuple[jax.Array, jax.Array]:
+    """Return the gradient, shape (n,), and the Hessian, shape (n, n), of an energy at x."""
     return energy.gradient(x), jax.jacfwd(energy.gradient)(x)
 
 
 @functools.lru_cache(maxsize=64)
 @functools.lru_cache(maxsize=64)
 def body_velocity_slices(algebra: mf.LieAlgebra) -> Mapping[str, slice]:
-    """Return where a velocity of the algebra holds those of a rigid body and of its rotors, by name; empty without."""
+    """Return slices of a velocity for ``angular_velocity`` and ``rotor_rates``, by name; {} if it is no body."""
     if not begins_with_rotations(algebra):
         return {}
     has_rotors = algebra.dim > 3 and _is_body_algebra(algebra)
@@ -348,8 +350,9 @@ MAX_BODY_DIM = 64
 
 
 @functools.lru_cache(maxsize=64)
-def _leading_casimirs(algebra: mf.LieAlgebra, names: tuple[str, ...] | None) -> dict[str, Energy]:
-    del names  # a key of the cache: equal algebras may differ in the names with which their Casimirs print
+def _leading_casimirs(algebra: mf.LieAlgebra, basis_names: tuple[str, ...] | None) -> dict[str, Energy]:
+    """Return the Casimirs of an algebra, by name, as energies."""
+    del basis_names  # a key of the cache: equal algebras may differ in the names with which their Casimirs print
     casimirs: dict[str, Energy] = {}
     with jax.ensure_compile_time_eval():  # the cache outlives any trace
         for name, casimir in algebra.leading_casimirs():
@@ -359,28 +362,30 @@ def _leading_casimirs(algebra: mf.LieAlgebra, names: tuple[str, ...] | None) -> 
 
 
 @functools.lru_cache(maxsize=64)
-def _casimirs_of_first(algebra: mf.LieAlgebra, names: tuple[str, ...] | None, n: int) -> frozenset[str]:
-    """Return the names of the leading Casimirs that depend on the first n components."""
+def _names_of_casimirs_depending_on_first(
+    algebra: mf.LieAlgebra, basis_names: tuple[str, ...] | None, n: int
+) -> frozenset[str]:
+    """Return the names of the Casimirs that depend on the first n components of a momentum."""
     x = np.random.default_rng(0).standard_normal(algebra.dim)
     with jax.ensure_compile_time_eval():
-        casimirs = _leading_casimirs(algebra, names).items()
+        casimirs = _leading_casimirs(algebra, basis_names).items()
         return frozenset(name for name, C in casimirs if bool(C.gradient(jnp.asarray(x))[:n].any()))
 
 
 @functools.lru_cache(maxsize=64)
-def _casimirs_of_components(
-    algebra: mf.LieAlgebra, names: tuple[str, ...] | None, indices: tuple[int, ...]
+def _names_of_casimirs_depending_only_on(
+    algebra: mf.LieAlgebra, basis_names: tuple[str, ...] | None, indices: tuple[int, ...]
 ) -> frozenset[str]:
-    """Return the names of those leading Casimirs that depend only on the components with the given indices."""
+    """Return the names of the Casimirs that depend on no components except those with the given indices."""
     x, complement = np.random.default_rng(0).standard_normal(algebra.dim), np.delete(np.arange(algebra.dim), indices)
     with jax.ensure_compile_time_eval():
-        casimirs = _leading_casimirs(algebra, names).items()
+        casimirs = _leading_casimirs(algebra, basis_names).items()
         return frozenset(name for name, C in casimirs if not bool(C.gradient(jnp.asarray(x))[complement].any()))
 
 
 @functools.lru_cache(maxsize=64)
-def _spans_all_casimirs(algebra: mf.LieAlgebra) -> bool:
-    """Return whether the gradients of the leading Casimirs span the kernel of the Poisson tensor at a random point."""
+def _are_all_casimirs_known(algebra: mf.LieAlgebra) -> bool:
+    """Return whether the gradients of the known Casimirs span the kernel of the Poisson tensor at a random point."""
     casimirs = _leading_casimirs(algebra, algebra.basis_names).values()
     x = np.random.default_rng(0).standard_normal(algebra.dim)
     if not casimirs or len(casimirs) < algebra.casimir_count():

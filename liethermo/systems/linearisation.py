@@ -25,7 +25,7 @@ from .base import System
 from .conservation import dissipation_keeps_casimirs
 from .invariants import resolve_invariants_near, stack_gradients, systems_at_test_times
 from .kind_checks import require_system
-from .leaf_stability import has_definite_integral, retract
+from .leaf_stability import has_lyapunov_function, retract
 
 REST_RTOL = 1e-7
 """Largest velocity at an equilibrium, relative to the Jacobian times the norm of the state. An equilibrium with six
@@ -64,7 +64,7 @@ class Stability(enum.StrEnum, metaclass=ListedEnumType):
 
 
 class FieldDerivatives(NamedTuple):
-    """The vector field and some functions near a state, as functions of coordinates of the tangent space.
+    """Values and derivatives of the vector field and of functions at a state, in coordinates of a tangent frame.
 
     Attributes
     ----------
@@ -85,14 +85,14 @@ class FieldDerivatives(NamedTuple):
 
 
 def tangent_frame(system: System, x) -> jax.Array:
-    """Return a basis of the tangent space of the state space at x, shape (m, n); the unit vectors on R^n."""
+    """Return a basis of the tangent space at the state x, shape (m, n); the unit vectors on R^n."""
     if system.space is None:
         return jnp.eye(system.dim)
     return system.space.to_vector(system.space._frame(system.points(x)))
 
 
 def field_derivatives(system_and_functions: tuple[System, tuple[Energy, ...]], x) -> FieldDerivatives:
-    """Return the field of a system, functions, and the derivatives of both at x; traced by JAX."""
+    """Return the vector field of a system, values of functions, and the derivatives of both at a state x."""
     system, functions = system_and_functions
     frame = jax.lax.stop_gradient(tangent_frame(system, x))
 
@@ -107,11 +107,12 @@ def field_derivatives(system_and_functions: tuple[System, tuple[Energy, ...]], x
 
 
 def _poisson_tensor(system: System, x) -> jax.Array:
+    """Return the Poisson tensor at a state as a matrix, shape (n, n)."""
     return jax.jacfwd(lambda alpha: system.poisson.sharp(x, alpha))(jnp.zeros(system.dim))
 
 
-def counter_components(system: System) -> np.ndarray:
-    """Return the components that only count heat, shape (k,): the entropies of baths of constant temperature.
+def heat_counter_indices(system: System) -> np.ndarray:
+    """Return the indices, shape (k,), of the entropies of baths of constant temperature, which only count heat.
 
     The motion of the other components does not depend on them, so they may grow in a steady state.
     """
@@ -124,8 +125,8 @@ def counter_components(system: System) -> np.ndarray:
     return system.body_dim + np.flatnonzero(is_constant)
 
 
-def frozen_system(system: System, t: float | None) -> System:
-    """Return the system at the time t, or unchanged if it does not depend on time.
+def freeze_system(system: System, t: float | None) -> System:
+    """Return the system frozen at the time t; unchanged if it does not depend on time.
 
     Raises
     ------
@@ -150,7 +151,7 @@ def frozen_system(system: System, t: float | None) -> System:
 
 
 def _describe_time_dependent_part(system: System) -> str:
-    """Return which part of a driven system depends on time, as a clause; "" if none does at the test times."""
+    """Return a clause that says which part of a driven system depends on time; "" if none does at the test times."""
     points = system.samples(3)
     velocities = np.stack([evaluate_at_points(_velocity, s, points) for s in systems_at_test_times(system)])
     scale = np.abs(velocities).max()
@@ -163,33 +164,34 @@ def _describe_time_dependent_part(system: System) -> str:
 
 
 def _velocity(system: System, x) -> jax.Array:
+    """Return the vector field at one state, shape (n,)."""
     return system._vector_field(x)
 
 
 def conserved_functions(system: System, x) -> dict[str, Energy]:
-    """Return the functions that a frozen system conserves near x, by name, the energy last.
+    """Return the functions that a frozen system conserves near the states x, by name, the energy last.
 
     Functions of the entropies of baths of constant temperature are left out.
     """
     system = resolve_invariants_near(system, system.state_array(x, batch=True))
     functions = system.functions()
-    first_integrals, components = system.first_integrals(), system.casimir_components()
-    conserved = {}
+    first_integrals, components = system.first_integrals(), system.casimir_terms()
+    conserved_by_name = {}
     for name, g in functions.items():
         if name in first_integrals:
-            conserved.update(components.get(name, {name: g}))
+            conserved_by_name.update(components.get(name, {name: g}))
     if system.energy_law == "conserved" and not system.torque_laws.name:
-        conserved["energy"] = system.energy
-    counters = counter_components(system)
-    if not counters.size or not conserved:
-        return conserved
-    gradients = evaluate_at_points(stack_gradients, tuple(conserved.values()), np.atleast_2d(np.asarray(x)))
-    keeps = ~gradients[:, :, counters].any(axis=(0, 2))
-    return {name: g for (name, g), keep in zip(conserved.items(), keeps, strict=True) if keep}
+        conserved_by_name["energy"] = system.energy
+    counter_indices = heat_counter_indices(system)
+    if not counter_indices.size or not conserved_by_name:
+        return conserved_by_name
+    gradients = evaluate_at_points(stack_gradients, tuple(conserved_by_name.values()), np.atleast_2d(np.asarray(x)))
+    keeps = ~gradients[:, :, counter_indices].any(axis=(0, 2))
+    return {name: g for (name, g), keep in zip(conserved_by_name.items(), keeps, strict=True) if keep}
 
 
-def joined_names(names: Sequence[str]) -> str:
-    """Return names in one text, of a long list the first and the last ones."""
+def abbreviate_names(names: Sequence[str]) -> str:
+    """Return names joined in one text; of a long list only the first and the last ones."""
     if len(names) <= 2 * PRINTED_NAMES:
         return ", ".join(names)
     n_left_out = len(names) - 2 * PRINTED_NAMES
@@ -197,7 +199,7 @@ def joined_names(names: Sequence[str]) -> str:
 
 
 class Leaf(NamedTuple):
-    """The tangent space of the common level sets of conserved functions at a state.
+    """The tangent space, at a state, of the common level set of conserved functions.
 
     Attributes
     ----------
@@ -217,7 +219,7 @@ class Leaf(NamedTuple):
 def leaf_at(
     system: System, x: np.ndarray, functions: dict[str, Energy], gradients: np.ndarray, frame: np.ndarray, scale: float
 ) -> Leaf:
-    """Return the :class:`Leaf` through x, from the gradients there of conserved functions, shape (functions, m)."""
+    """Return the :class:`Leaf` through x, from the gradients of conserved functions there, shape (functions, m)."""
     rows, names = [], []
     if functions:
         samples = system.samples(3, scale=scale)
@@ -229,24 +231,26 @@ def leaf_at(
                 rows.append(gradient / length)
                 names.append(name)
     n_rows = len(rows)
-    if (kernel := _regular_kernel(system, x, scale)) is not None:
+    if (kernel := _poisson_kernel_on_regular_leaf(system, x, scale)) is not None:
         rows.extend(kernel @ frame.T)
     m = frame.shape[0]
     _, singular_values, vectors = np.linalg.svd(np.array(rows).reshape(-1, m), full_matrices=True)
     rank = int(np.sum(singular_values > GRADIENT_RTOL))
     if kernel is not None:
-        known = np.linalg.matrix_rank(np.array(rows[:n_rows]).reshape(-1, m), tol=GRADIENT_RTOL) if n_rows else 0
-        names += [UNKNOWN_CASIMIRS] if rank > known else []
+        rank_of_known = (
+            np.linalg.matrix_rank(np.array(rows[:n_rows]).reshape(-1, m), tol=GRADIENT_RTOL) if n_rows else 0
+        )
+        names += [UNKNOWN_CASIMIRS] if rank > rank_of_known else []
     return Leaf(vectors[rank:].T, tuple(names), rank)
 
 
-def _regular_kernel(system: System, x: np.ndarray, scale: float) -> np.ndarray | None:
-    """Return a basis of the kernel of Pi(x), shape (k, n), if the motion stays on the symplectic leaf through x.
+def _poisson_kernel_on_regular_leaf(system: System, x: np.ndarray, scale: float) -> np.ndarray | None:
+    """Return a basis of the kernel of Pi(x), shape (k, n), if the motion stays on the symplectic leaf of x, else None.
 
     None if all Casimirs are known, if x lies on a leaf of lower dimension, or if the dissipation leaves the leaf.
     """
-    by_form = dissipation_keeps_casimirs(system)
-    if not by_form or system.torque_laws.name or system.space is not None or system.baths.number:
+    keeps_casimirs = dissipation_keeps_casimirs(system)
+    if not keeps_casimirs or system.torque_laws.name or system.space is not None or system.baths.number:
         return None
     if system.orbit_levels.has_all_casimirs or system.dim > MAX_TENSOR_DIM:
         return None
@@ -326,7 +330,7 @@ class Linearisation:
         return bool((np.abs(self.eigenvalues) > self.eigenvalue_errors).all())
 
     def __str__(self) -> str:
-        leaf = joined_names(self.leaf_names) or "no conserved function"
+        leaf = abbreviate_names(self.leaf_names) or "no conserved function"
         head = (
             f"Equilibrium, {self.stability}, {len(self.eigenvalues)} modes on the leaf of: {leaf}\n"
             f"{'rate of decay':>16} {'angular frequency':>19}\n"
@@ -335,13 +339,13 @@ class Linearisation:
         return head + "\n".join(f"{rate:16.6g} {frequency:19.6g}" for rate, frequency in rows)
 
     def _round_to_zero(self, numbers: np.ndarray) -> np.ndarray:
-        """Return numbers with those below the rounding of the eigenvalues as zeros."""
+        """Return numbers, shape (p,), with zeros in place of those below the rounding error of the eigenvalues."""
         return np.where(np.abs(numbers) <= self.eigenvalue_errors, 0.0, numbers)
 
 
 @with_library_settings
 def linearise(system: System, x, t: float | None = None) -> Linearisation:
-    """Return the linear motion near an equilibrium on its leaf: eigenvalues, rates of decay, frequencies, stability.
+    """Return the linear motion near an equilibrium on its leaf, with decay rates, frequencies and stability.
 
     A system conserves its Casimirs and, if it is closed, its energy. A displacement that changes one of them does not
     decay, so these directions say nothing about stability. They are taken out: the Jacobian is restricted to the
@@ -383,12 +387,12 @@ def linearise(system: System, x, t: float | None = None) -> Linearisation:
     ... )
     (False, True)
     """
-    system = frozen_system(system, t)
+    system = freeze_system(system, t)
     x = np.asarray(system.state(x))
-    derivatives, functions = derivatives_at(system, x)
+    derivatives, functions = field_derivatives_and_invariants(system, x)
     size = float(np.linalg.norm(x))
     limit = REST_RTOL * np.linalg.norm(derivatives.jacobian) * (size or 1.0)
-    velocity = np.delete(derivatives.velocity, counter_components(system))
+    velocity = np.delete(derivatives.velocity, heat_counter_indices(system))
     if not np.linalg.norm(velocity) <= limit:
         raise InputError(
             f"x is not an equilibrium: the vector field there has the norm {np.linalg.norm(velocity):.3g}. Find one "
@@ -397,8 +401,8 @@ def linearise(system: System, x, t: float | None = None) -> Linearisation:
     return linearise_at(system, x, derivatives, functions, size or 1.0)
 
 
-def derivatives_at(system: System, x: np.ndarray) -> tuple[FieldDerivatives, dict[str, Energy]]:
-    """Return the field with its derivatives at x, and the conserved functions by name."""
+def field_derivatives_and_invariants(system: System, x: np.ndarray) -> tuple[FieldDerivatives, dict[str, Energy]]:
+    """Return the vector field with its derivatives at x, and the functions conserved there by name."""
     functions = conserved_functions(system, x)
     derivatives = evaluate_at_points(field_derivatives, (system, tuple(functions.values())), x[None])
     return FieldDerivatives(*(a[0] for a in derivatives)), functions
@@ -407,17 +411,17 @@ def derivatives_at(system: System, x: np.ndarray) -> tuple[FieldDerivatives, dic
 def linearise_at(
     system: System, x: np.ndarray, derivatives: FieldDerivatives, functions: dict[str, Energy], scale: float
 ) -> Linearisation:
-    """Return the linear motion near an equilibrium x of a frozen system, from the derivatives there."""
-    counters = counter_components(system)
+    """Return the linear motion near an equilibrium x of a frozen system, from derivatives computed there."""
+    counter_indices = heat_counter_indices(system)
     frame = derivatives.frame
     n = frame.shape[1]
-    body = np.delete(np.arange(len(frame)), counters) if counters.size else np.arange(len(frame))
+    body = np.delete(np.arange(len(frame)), counter_indices) if counter_indices.size else np.arange(len(frame))
     # On R^n the frame is the identity; baths of constant temperature on a manifold are its last coordinates.
-    if counters.size and system.space is not None:
-        body = np.flatnonzero(~np.abs(frame[:, counters]).any(axis=1))
+    if counter_indices.size and system.space is not None:
+        body = np.flatnonzero(~np.abs(frame[:, counter_indices]).any(axis=1))
     frame, gradients = frame[body], derivatives.gradients[:, body]
     to_coordinates = np.linalg.pinv(frame.T)
-    to_coordinates[:, counters] = 0.0
+    to_coordinates[:, counter_indices] = 0.0
     matrix = to_coordinates @ derivatives.jacobian[:, body]
     leaf = leaf_at(system, x, functions, gradients, frame, scale)
     leaf_matrix = leaf.basis.T @ matrix @ leaf.basis
@@ -428,7 +432,7 @@ def linearise_at(
     elif (growth < -errors).all() and len(growth):
         stability = Stability.ASYMPTOTIC
     else:
-        definite = has_definite_integral(system, x, frame, leaf.basis, functions)
+        definite = has_lyapunov_function(system, x, frame, leaf.basis, functions)
         stability = Stability.STABLE if definite else Stability.SPECTRAL
     basis = frame.T @ leaf.basis
     jacobian = derivatives.jacobian @ np.linalg.pinv(derivatives.frame.T)
@@ -439,24 +443,25 @@ def linearise_at(
 
 
 def _sorted_eigenvalues(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return eigenvalues by falling real part, eigenvectors, and bounds of the rounding of the eigenvalues."""
+    """Return eigenvalues by falling real part, eigenvectors as columns, and error bounds of the eigenvalues."""
     if not matrix.size:
         return np.zeros(0, complex), np.zeros((0, 0), complex), np.zeros(0)
-    eigenvalues, left, right = scipy.linalg.eig(matrix, left=True, right=True)
-    overlaps = np.abs(np.sum(left.conj() * right, axis=0))
+    eigenvalues, left_vectors, right_vectors = scipy.linalg.eig(matrix, left=True, right=True)
+    overlaps = np.abs(np.sum(left_vectors.conj() * right_vectors, axis=0))
     n, norm = len(matrix), float(np.linalg.norm(matrix, 2))
     with np.errstate(divide="ignore"):
         errors = np.minimum(EIGENVALUE_RTOL * n / overlaps, MAX_EIGENVALUE_RTOL) * norm
     order = np.lexsort((-eigenvalues.imag, -np.round(eigenvalues.real / (norm or 1.0), 12)))
-    return eigenvalues[order], right[:, order], errors[order]
+    return eigenvalues[order], right_vectors[:, order], errors[order]
 
 
-def values_of(functions: Sequence[Energy], x: np.ndarray) -> np.ndarray:
-    """Return the values of functions at states, shape (m, n) to (m, functions)."""
+def evaluate_functions(functions: Sequence[Energy], states: np.ndarray) -> np.ndarray:
+    """Return the values of functions at states, shape (m, n), as an array, shape (m, functions)."""
     if not functions:
-        return np.zeros((len(x), 0))
-    return evaluate_at_points(_values, tuple(functions), x)
+        return np.zeros((len(states), 0))
+    return evaluate_at_points(_values, tuple(functions), states)
 
 
 def _values(functions: tuple[Energy, ...], x) -> jax.Array:
+    """Return the values of functions at one state, shape (functions,)."""
     return jnp.stack([g.value(x) for g in functions])

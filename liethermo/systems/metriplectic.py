@@ -19,7 +19,7 @@ from .embedded import ChartSystem, EmbeddedSystem
 
 
 class MetriplecticSystem(System):
-    """A system with energy, entropy and dissipation on R^n or on a manifold, in its most general form [BFM 2.3, §4.4].
+    """The most general metriplectic system, with any Poisson structure on R^n or on a manifold [BFM 2.3, §4.4].
 
     The state moves by ``x' = Pi(x) grad H + K(x) grad S``, with a Poisson tensor Pi and a friction matrix K.
 
@@ -114,7 +114,7 @@ class MetriplecticSystem(System):
         self._build(poisson, poisson.dim, energy, entropy, dissipation, momentum_maps, validate, space, baths)
 
     def local_system(self, x, is_centred: bool = False) -> tuple[System, jax.Array]:
-        """Return the embedded system and x, or the system in a chart of the exponential map and its origin.
+        """Return the system embedded in arrays and x, or the system in a chart around x and the origin of the chart.
 
         With ``is_centred`` the local system is for use at x alone.
         """
@@ -122,5 +122,5 @@ class MetriplecticSystem(System):
             return self, x
         if self.space.can_be_embedded:
             return EmbeddedSystem(self), x
-        around = mf.coordinates_around(mf.RiemannianRetraction(self.space), self.points(x))
-        return ChartSystem(self, around, around.centre() if is_centred else None), jnp.zeros(self.space.dim)
+        coordinates = mf.coordinates_around(mf.RiemannianRetraction(self.space), self.points(x))
+        return ChartSystem(self, coordinates, coordinates.centre() if is_centred else None), jnp.zeros(self.space.dim)

@@ -36,7 +36,13 @@ from .baths import BathEntropy, HeatBaths, checked_baths, poisson_with_baths
 from .conditions import RunCondition
 from .domain import Domain
 from .equilibria import Equilibrium, steady_state
-from .hamiltonian import checked_density_matrices, checked_parts, hamiltonian_energy, join_baths, tensor_with_identity
+from .hamiltonian import (
+    checked_density_matrices,
+    checked_factor_dims_and_names,
+    join_baths,
+    make_hamiltonian_energy,
+    tensor_with_identity,
+)
 from .interface import EngineHints, InvariantVerdicts
 from .invariants import systems_at_test_times
 from .states import checked_times
@@ -58,7 +64,7 @@ ADIABATIC_ROW = "adiabatic parameter"
 
 
 class QuantumSystem(System):
-    """A density matrix with a Hamiltonian, dissipation and heat baths: ``rho' = -i [H, rho] + ...`` (hbar = k_B = 1).
+    """A density matrix with Hamiltonian, dissipation and heat baths, ``rho' = -i [H, rho] + ...`` (hbar = k_B = 1).
 
     The energy is ``tr(rho H) + U(y)`` and the entropy ``-tr(rho ln rho) + sum y``, with the entropies y of the baths. A
     state is a row of real numbers: the coordinates of rho (:class:`manifolds.DensityMatrices`) and then y.
@@ -130,16 +136,16 @@ class QuantumSystem(System):
     ):
         baths = checked_baths(baths)
         self.time = None
-        size, energy = hamiltonian_energy(hamiltonian, times)
+        size, energy = make_hamiltonian_energy(hamiltonian, times)
         self.structure = structure = mf.DensityMatrices(size)
-        self.parts, self.names = checked_parts(parts, names, size)
+        self.parts, self.names = checked_factor_dims_and_names(parts, names, size)
         entropy = VonNeumann() if entropy is None else entropy
         if not isinstance(entropy, VonNeumann):
             raise InputError(
                 f"the entropy of a density matrix must be lt.VonNeumann(...), got {type(entropy).__name__}"
             )
         self.floor = entropy.floor
-        terms = _checked_terms(dissipation)
+        terms = _checked_quantum_dissipations(dissipation)
         if all(isinstance(term, LindbladJumps) for term in terms):
             entropy = IsolatedVonNeumann(self.floor)  # the motion does not depend on it
         terms = tuple(_bind_to_density(term, structure) for term in terms)
@@ -155,7 +161,7 @@ class QuantumSystem(System):
             poisson, energy = poisson_with_baths(structure, m), BodyBathsEnergy(energy, baths.energy, n, n + m)
             total_entropy = Sum((entropy.on(range(n)), BathEntropy(m)))
         self._build(poisson, n + m, energy, total_entropy, terms or None, {}, validate)
-        if not self.preserved:  # preserved observables are tested instead
+        if not self.preserved_functions:  # preserved observables are tested instead
             self.invariant_verdicts = InvariantVerdicts(frozenset(self.casimirs()), frozenset())
 
     # -- time ---------------------------------------------------------------------------------------------------------
@@ -166,7 +172,7 @@ class QuantumSystem(System):
         return super().is_driven or (self.time is None and self.total_dissipation.depends_on_time)
 
     def at_time(self, t, attitude=None) -> QuantumSystem:
-        """Return the system with its Hamiltonian and its rates frozen at the time t; an attitude plays no part."""
+        """Return the system with its Hamiltonian and its rates frozen at the time t; the attitude is ignored."""
         if not self.is_driven:
             return self
         return replace_fields(super().at_time(t), time=jnp.asarray(t, dtype=jnp.float64))
@@ -178,7 +184,7 @@ class QuantumSystem(System):
     # -- states -------------------------------------------------------------------------------------------------------
 
     def state(self, rho, batch: bool = False, entropies=None, mixed: float = 0.0) -> jax.Array:
-        """Return the state, shape (..., n), that has a density matrix, shape (N, N), or a batch of them (..., N, N).
+        """Return the state, shape (..., n), of density matrices, shape (..., N, N), or of pure states.
 
         Parameters
         ----------
@@ -196,7 +202,7 @@ class QuantumSystem(System):
         ------
         InputError
         """
-        rho = self._array_of(rho)
+        rho = self._array_of_qobj(rho)
         if isinstance(rho, jax.core.Tracer) or (np.shape(rho)[-1:] == (self.dim,) and not self._is_matrix(rho, batch)):
             return super().state(rho, batch)
         matrices = checked_density_matrices(np.asarray(rho), self.structure.size, mixed)
@@ -208,26 +214,26 @@ class QuantumSystem(System):
         return jnp.asarray(np.concatenate([x, np.broadcast_to(y, (*front, m))], axis=-1))
 
     def state_array(self, x, batch: bool = False):
-        """Return the state x; a matrix or a ket becomes the state with every bath at entropy zero."""
-        x = self._array_of(x)
+        """Return the state x, checked; a matrix or a ket becomes the state with all bath entropies zero."""
+        x = self._array_of_qobj(x)
         if not isinstance(x, jax.core.Tracer) and (self._is_matrix(x, batch) or self._is_ket(x)):
             x = np.asarray(self.state(x))
         return super().state_array(x, batch)
 
-    def _array_of(self, x):
-        """Return the array of a ``Qobj``, with the adjoint of a stacked operator made a stacked operator."""
+    def _array_of_qobj(self, x):
+        """Return the array of a ``Qobj``, with a stacked bra turned into a stacked operator; other x unchanged."""
         if not isinstance(x, HasMatrix):
             return x
         array = np.asarray(x.full())  # an array of shape (1, N^2) that is no Qobj is a batch of one state
         return adjoint(array) if array.shape == (1, self.structure.size**2) and self.structure.size > 1 else array
 
     def _is_ket(self, x) -> bool:
-        """Return whether x has the shape of a ket, a bra or a stacked operator, with more than one level."""
+        """Return whether x has the shape of a ket, a bra or a stacked operator; False for one level."""
         size = self.structure.size
         return size > 1 and np.shape(x) in ((size,), (size, 1), (1, size), (size**2, 1))
 
     def _is_matrix(self, x, batch: bool) -> bool:
-        """Return whether x has the shape of a density matrix; of several with ``batch`` and more than one level."""
+        """Return whether x has the shape of a density matrix, or with ``batch`` of several."""
         size = self.structure.size
         return np.shape(x)[-2:] == (size, size) and (size > 1 or not batch)
 
@@ -239,7 +245,7 @@ class QuantumSystem(System):
         return self.structure.matrix(x[..., : self.body_dim])
 
     def reduced(self, x, part: int | str) -> jax.Array:
-        """Return the density matrix of one part of a product, the others traced out, shape (..., N_k, N_k).
+        """Return the reduced density matrix of one factor of a product, shape (..., N_k, N_k): a partial trace.
 
         Parameters
         ----------
@@ -259,14 +265,14 @@ class QuantumSystem(System):
         return jnp.einsum("...iajibj->...ab", tensor)
 
     def expectation(self, x, observable) -> jax.Array:
-        """Return ``tr(rho A)`` of states, shape (..., n) to (...), for an observable A, Hermitian, shape (N, N)."""
+        """Return the expectation value ``tr(rho A)``, shape (...), of a Hermitian observable A in states x."""
         observable = checked_hermitian(observable, "the observable")
         if observable.shape != (self.structure.size,) * 2:
             raise InputError(f"the observable must have shape {(self.structure.size,) * 2}, got {observable.shape}")
         return jnp.asarray(x)[..., : self.body_dim] @ self.structure.vector(observable)
 
     def bloch(self, x, part: int | str = 0) -> jax.Array:
-        """Return the Bloch vector ``tr(rho sigma)`` of a qubit, shape (..., n) to (..., 3).
+        """Return the Bloch vector ``tr(rho sigma)`` of a qubit, shape (..., 3), in states x.
 
         Parameters
         ----------
@@ -281,16 +287,18 @@ class QuantumSystem(System):
         return jnp.stack([2.0 * coherence.real, -2.0 * coherence.imag, (rho[..., 0, 0] - rho[..., 1, 1]).real], axis=-1)
 
     def samples(self, count: int, seed: int = 0, scale: float = 1.0) -> np.ndarray:
-        """Return ``count`` random states: density matrices of Ginibre's ensemble, and entropies of baths."""
+        """Return random states, shape (count, n): density matrices of Ginibre's ensemble, and bath entropies."""
         rng, size = np.random.default_rng(seed), self.structure.size
         root = rng.standard_normal((count, size, size, 2)) @ np.array([1.0, 1.0j])
         rho = root @ adjoint(root)
         rho = rho / np.trace(rho, axis1=-2, axis2=-1)[:, None, None]
         x = np.asarray(self.structure.vector(rho))
-        return np.concatenate([x, rng.standard_normal((count, self.baths.number)) * self.baths.scale], axis=-1)
+        return np.concatenate(
+            [x, rng.standard_normal((count, self.baths.number)) * self.baths.constant_entropy_scales], axis=-1
+        )
 
-    def resting_guess(self) -> np.ndarray:
-        """Return the completely mixed state, with baths at entropy zero."""
+    def steady_state_guess(self) -> np.ndarray:
+        """Return the completely mixed state with all bath entropies zero, shape (n,)."""
         return np.asarray(self.state(np.eye(self.structure.size) / self.structure.size))
 
     @property
@@ -298,6 +306,7 @@ class QuantumSystem(System):
         return Domain(why_outside=self._why_outside, why_singular=self._why_singular)
 
     def _why_outside(self, x) -> str:
+        """Return why states are outside of the cone of density matrices, as a text; "" if all are inside."""
         if is_traced(self):
             return ""
         rho = self._density_matrices(x)
@@ -317,14 +326,14 @@ class QuantumSystem(System):
 
     def run_conditions(self, x, t, guarantees):
         rho = self._density_matrices(x)
-        smallest = float(np.linalg.eigvalsh(rho)[:, 0].min())
+        min_eigenvalue = float(np.linalg.eigvalsh(rho)[:, 0].min())
         conditions = []
         if self._has_dissipation(LindbladJumps):
             note = "the method keeps the density matrix positive only to the error of its steps"
-            row = RunCondition(POSITIVITY_ROW, smallest, note=note, is_minimum=True)
+            row = RunCondition(POSITIVITY_ROW, min_eigenvalue, note=note, is_minimum=True)
             if "positivity" in guarantees:
                 limit = -NEGATIVE_EIGENVALUE_LIMIT
-                row = RunCondition(POSITIVITY_ROW, smallest, limit, smallest >= limit, is_minimum=True)
+                row = RunCondition(POSITIVITY_ROW, min_eigenvalue, limit, min_eigenvalue >= limit, is_minimum=True)
             conditions.append(row)
         if self._has_dissipation(AdiabaticJumps):
             parameter = float(np.max(np.asarray(self.adiabatic_parameter(np.unique(t)))))
@@ -336,36 +345,38 @@ class QuantumSystem(System):
     def _why_rank_grows(self, x: np.ndarray, rho: np.ndarray) -> str:
         """Return why zero eigenvalues would not stay zero under steepest ascent, as a text; "" if they stay zero."""
         kernels = self._kernels(rho)
-        use = [i for i, kernel in enumerate(kernels) if kernel.size]
-        turned = [self._is_kernel_rotated(rho[i], kernels[i]) for i in use]
+        rank_deficient = [i for i, kernel in enumerate(kernels) if kernel.size]
+        is_rotated = [self._is_kernel_rotated(rho[i], kernels[i]) for i in rank_deficient]
         mix = "Use system.state(rho, mixed=1e-6)"
         if self.floor > 0.0:
             text = (
                 "its density matrix has zero eigenvalues whose eigenvectors the Hamiltonian turns, so steepest ascent "
             )
             text += f"would amplify the error of a step. {mix}"
-            return text if any(turned) else ""
-        grows = [self._equilibrium_population(x[i], kernels[i]) > self._zero_eigenvalue_limit for i in use]
+            return text if any(is_rotated) else ""
+        grows = [self._equilibrium_population(x[i], kernels[i]) > self._zero_eigenvalue_limit for i in rank_deficient]
         if not any(grows):
             return ""
-        first = grows.index(True)
+        first_growing = grows.index(True)
+        eigenvalue = np.linalg.eigvalsh(rho[rank_deficient[first_growing]])[0]
         floor = ", or give the system entropy=lt.VonNeumann(floor=1e-12), which keeps this eigenvalue at zero"
         return (
-            f"its density matrix has the eigenvalue {np.linalg.eigvalsh(rho[use[first]])[0]:.3g}, where the gradient "
-            f"of the entropy is infinite. {mix}{'' if turned[first] else floor}"
+            f"its density matrix has the eigenvalue {eigenvalue:.3g}, where the gradient of the entropy is infinite. "
+            f"{mix}{'' if is_rotated[first_growing] else floor}"
         )
 
     def _is_kernel_rotated(self, rho: np.ndarray, kernel: np.ndarray) -> bool:
-        """Return whether the Hamiltonian changes a kernel, shape (N, r), by more than the rounding of the kernel."""
+        """Return whether the Hamiltonian moves a kernel of rho, shape (N, r), by more than its rounding error."""
         complement = np.eye(len(rho)) - kernel @ adjoint(kernel)
         p = np.linalg.eigvalsh(rho)
-        smallest = p[p > self._zero_eigenvalue_limit].min()
+        smallest_positive = p[p > self._zero_eigenvalue_limit].min()
         return any(
-            np.abs(complement @ H @ kernel).max() > level_gap_rounding(H) / smallest for H in self.hamiltonians()
+            np.abs(complement @ H @ kernel).max() > level_gap_rounding(H) / smallest_positive
+            for H in self.hamiltonians_at_test_times()
         )
 
     def _equilibrium_population(self, x: np.ndarray, kernel: np.ndarray) -> float:
-        """Estimate the largest population of a state in a kernel, shape (N, r), at the end of steepest ascent.
+        """Return an estimate of the largest population in a kernel, shape (N, r), at the end of steepest ascent.
 
         At the end ``-ln rho - 1`` is a combination of the preserved gradients, which is fitted outside the kernel.
         """
@@ -376,29 +387,32 @@ class QuantumSystem(System):
         return float(np.exp(np.linalg.eigvalsh(adjoint(kernel) @ affinity @ kernel)[-1] - 1.0))
 
     def _why_singular(self, x) -> str:
+        """Return why the gradient of the entropy is infinite at states, as a text; "" if it is finite."""
         if is_traced(self) or not self._has_dissipation(ThermalJumps):
             return ""
         x, rho = np.atleast_2d(x), self._density_matrices(x)
         kernels = self._kernels(rho)
-        use = [i for i, kernel in enumerate(kernels) if kernel.size]
-        if not use:
+        rank_deficient = [i for i, kernel in enumerate(kernels) if kernel.size]
+        if not rank_deficient:
             return ""
-        fill_rates, rate_scales = self._jump_rates(x[use], [kernels[i] for i in use])
+        fill_rates, rate_scales = self._kernel_fill_rates_and_scales(
+            x[rank_deficient], [kernels[i] for i in rank_deficient]
+        )
         # larger than the rounding of a population at rest
         grows = np.flatnonzero(fill_rates > self._zero_eigenvalue_limit * rate_scales)
         if not grows.size:
             return ""
-        eigenvalue = np.linalg.eigvalsh(rho[use[grows[0]]])[0]
-        otherwise = (
+        eigenvalue = np.linalg.eigvalsh(rho[rank_deficient[grows[0]]])[0]
+        alternative = (
             ", or lt.MetriplecticRungeKutta, which does not evaluate this gradient" if has_generator(self) else ""
         )
         return (
             f"its density matrix has the eigenvalue {eigenvalue:.3g}, where the gradient of the entropy is infinite, "
-            f"and jumps move the state off it. Use system.state(rho, mixed=1e-6){otherwise}"
+            f"and jumps move the state off it. Use system.state(rho, mixed=1e-6){alternative}"
         )
 
-    def _jump_rates(self, x: np.ndarray, kernels: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Return rates at which jumps fill the kernels of states, and scales of their rates, shapes (m,)."""
+    def _kernel_fill_rates_and_scales(self, x: np.ndarray, kernels: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rates at which jumps populate the kernels of states, and their scales, shapes (m,)."""
         assert self.dissipation is not None
         jumps = [term for term in self.dissipation.terms if isinstance(term, ThermalJumps)]
 
@@ -425,20 +439,21 @@ class QuantumSystem(System):
         return max(self.floor, ZERO_EIGENVALUE_PER_LEVEL * self.structure.size)
 
     def _kernels(self, rho: np.ndarray) -> list[np.ndarray]:
-        """Return the kernels of matrices, shape (m, N, N), each as eigenvectors, shape (N, r)."""
+        """Return the kernel of each density matrix, shape (m, N, N), as a list of bases, shape (N, r)."""
         return [vectors[:, p <= self._zero_eigenvalue_limit] for p, vectors in zip(*np.linalg.eigh(rho), strict=True)]
 
     def _has_dissipation(self, kind: type[Dissipation]) -> bool:
+        """Return whether the dissipation has a summand of a given class."""
         return any(isinstance(term, kind) for term in self.total_dissipation.terms)
 
     @property
-    def hints(self) -> EngineHints:
-        return super().hints._replace(has_matrix_functions=True)
+    def engine_hints(self) -> EngineHints:
+        return super().engine_hints._replace(has_matrix_functions=True)
 
     # -- heat ---------------------------------------------------------------------------------------------------------
 
     def heat_currents(self, x, t=None) -> jax.Array:
-        """Return the heat that flows from each bath into the system, shape (..., baths) (energy / time).
+        """Return the heat current from each bath into the system, shape (..., baths) (energy / time).
 
         It is ``-T y'`` with the temperature T and the entropy y of a bath. At a steady state the currents and the power
         of the drive add up to zero.
@@ -454,7 +469,7 @@ class QuantumSystem(System):
         return -self.temperatures(x, t) * self.vector_field(x, t)[..., self.body_dim :]
 
     def entropy_production(self, x, t=None) -> jax.Array:
-        """Return the rate of growth of the entropy of system and baths, shape (...), at states x and the time t.
+        """Return the growth rate of the entropy of system and baths, shape (...), at states x and the time t.
 
         It is >= 0 under thermal jumps: ``dS/dt - sum (heat current / temperature)``. At a steady state only the baths
         contribute. Under :class:`liethermo.LindbladJumps` it is the rate of the entropy of rho, of either sign.
@@ -474,7 +489,7 @@ class QuantumSystem(System):
         return steady_state(self, x0, t)
 
     def power(self, x, t=None) -> jax.Array:
-        """Return the power of the drive, ``tr(rho dH/dt)``, shape (...) (energy / time): work received by the system.
+        """Return the power that the drive gives to the system, ``tr(rho dH/dt)``, shape (...) (energy / time).
 
         Parameters
         ----------
@@ -487,7 +502,9 @@ class QuantumSystem(System):
             return jnp.zeros(states.shape[:-1])
 
         def power_at(y, time):
-            return jax.jvp(lambda s: jnp.dot(self._hamiltonian_at(s), y[: self.body_dim]), (time,), (jnp.ones(()),))[1]
+            return jax.jvp(
+                lambda s: jnp.dot(self._hamiltonian_coordinates_at(s), y[: self.body_dim]), (time,), (jnp.ones(()),)
+            )[1]
 
         evaluate = jnp.vectorize(power_at, signature="(n),()->()")
         return evaluate(states, times)
@@ -506,21 +523,22 @@ class QuantumSystem(System):
         times = jnp.asarray(t, dtype=jnp.float64)
         if not self.energy.depends_on_time:
             return jnp.zeros(times.shape)
-        return jnp.vectorize(lambda s: adiabatic_parameter(self.structure, self._hamiltonian_at, s))(times)
+        return jnp.vectorize(lambda s: adiabatic_parameter(self.structure, self._hamiltonian_coordinates_at, s))(times)
 
-    def _hamiltonian_at(self, t) -> jax.Array:
-        """Return the coordinates of the Hamiltonian at a time, shape (N^2,), less a constant."""
+    def _hamiltonian_coordinates_at(self, t) -> jax.Array:
+        """Return the coordinates of the Hamiltonian at the time t, without a constant, shape (N^2,)."""
         return self.energy.at_time(t).gradient(jnp.zeros(self.dim))[: self.body_dim]
 
     # -- laws ---------------------------------------------------------------------------------------------------------
 
-    def hamiltonians(self) -> list[np.ndarray]:
-        """Return the Hamiltonian, at each test time if it depends on time."""
+    def hamiltonians_at_test_times(self) -> list[np.ndarray]:
+        """Return a list of the Hamiltonian, or of its values at the test times if it depends on time."""
         energies = [s.energy for s in (systems_at_test_times(self) if self.is_driven else [self])]
         energies = [E.body if isinstance(E, BodyBathsEnergy) else E for E in energies]  # temperatures may be traced
         return [self._hamiltonian_of(E) for E in energies]
 
     def _hamiltonian_of(self, energy: Energy) -> np.ndarray:
+        """Return the Hamiltonian, shape (N, N), of an energy ``tr(rho H)``."""
         if isinstance(energy, MeanEnergy):  # without a call of JAX, which would compile a program
             return np.asarray(self.structure.matrix(np.asarray(energy.b)))
         with jax.ensure_compile_time_eval():
@@ -528,7 +546,7 @@ class QuantumSystem(System):
             return np.asarray(self.structure.matrix(energy.gradient(origin)) + energy.value(origin) * one)
 
     def casimirs(self) -> dict[str, Energy]:
-        """Return the trace, and without dissipation the purity too."""
+        """Return the trace, and without dissipation the purity too, by name."""
         n = self.body_dim
         trace = Quadratic(np.zeros(n), np.where(np.arange(n) < self.structure.size, 1.0, 0.0))
         if not self.total_dissipation.terms:
@@ -565,7 +583,7 @@ class QuantumSystem(System):
         return QuantumSystem(total_H, terms or None, baths, VonNeumann(floor), parts, names)
 
     def coupled(self, interaction) -> QuantumSystem:
-        """Return the system with the Hamiltonian ``H + interaction``, shape (N, N), and its jumps split anew."""
+        """Return the system with an interaction, shape (N, N), added to the Hamiltonian; its jumps are split anew."""
         interaction = checked_hermitian(interaction, "the interaction")
         if interaction.shape != (self.structure.size,) * 2:
             raise InputError(
@@ -577,12 +595,14 @@ class QuantumSystem(System):
         return QuantumSystem(H, list(terms) or None, self.baths, VonNeumann(self.floor), self.parts, self.names)
 
     def _constant_hamiltonian(self) -> np.ndarray:
+        """Return the Hamiltonian, shape (N, N); InputError if it depends on time."""
         if self.is_driven:
             raise InputError("products and couplings are of systems whose Hamiltonian does not depend on time")
-        return self.hamiltonians()[0]
+        return self.hamiltonians_at_test_times()[0]
 
 
-def _checked_terms(dissipation) -> tuple[Dissipation, ...]:
+def _checked_quantum_dissipations(dissipation) -> tuple[Dissipation, ...]:
+    """Return the summands of a dissipation; InputError for one that does not act on density matrices."""
     terms = dissipation_terms(dissipation)
     for term in terms:
         if not isinstance(term, ThermalJumps | SteepestEntropyAscent | LindbladJumps):
@@ -594,4 +614,5 @@ def _checked_terms(dissipation) -> tuple[Dissipation, ...]:
 
 
 def _bind_to_density(term: Dissipation, structure: mf.DensityMatrices) -> Dissipation:
+    """Return a dissipation with its functions bound to the coordinates of density matrices, if it needs that."""
     return term.bind_to_structure(structure) if isinstance(term, SteepestEntropyAscent) else term

@@ -28,7 +28,7 @@ ELEMENTARY_AXES = {"x": 0, "y": 1, "z": 2}
 
 
 class AttitudeWarning(UserWarning):
-    """Attitudes that were rotations only to single precision, and have been projected onto SO(3)."""
+    """Warning that attitudes were rotations to single precision only, and have been projected onto SO(3)."""
 
 
 def attitude(
@@ -110,7 +110,7 @@ def attitude(
 
 
 def attitude_array(attitude: Any, group: mf.MatrixGroup | None) -> Any:
-    """Return a user's ``attitude=`` as an array: SciPy's rotations as matrices, matrices of SO(3) checked.
+    """Return a user's ``attitude=`` as an array, shape (..., m, m), checked if the group is SO(3).
 
     Attitudes in other groups, and None, are returned as they are.
     """
@@ -125,7 +125,7 @@ def attitude_array(attitude: Any, group: mf.MatrixGroup | None) -> Any:
 
 
 def rotation_matrices(rotations: Any) -> np.ndarray | jax.Array:
-    """Return rotation matrices, shape (..., 3, 3), projected onto SO(3) if they are in single precision."""
+    """Return checked rotation matrices, shape (..., 3, 3), projected onto SO(3) if in single precision."""
     if isinstance(rotations, Rotation):
         return np.asarray(rotations.as_matrix(), dtype=np.float64)
     matrices = checked_numbers(rotations, "the attitude")
@@ -163,21 +163,24 @@ def _warn_of_single_precision(distance: float, quantity: str) -> None:
 
 
 def _nearest_rotations(matrices: np.ndarray) -> np.ndarray:
-    """Return the rotations that are nearest to matrices, shape (..., 3, 3), in the Frobenius norm."""
+    """Return the rotation matrices, shape (..., 3, 3), nearest to given matrices in the Frobenius norm."""
     U, _, Vt = np.linalg.svd(matrices)
     sign = np.where(np.linalg.det(U @ Vt) < 0.0, -1.0, 1.0)
     U[..., 2] *= sign[..., None]
     return U @ Vt
 
 
-def check_scalar_place(scalar: str) -> None:
-    """Raise InputError unless the place of the real part of a quaternion is "last" or "first"."""
-    if scalar not in ("last", "first"):
-        raise InputError(f"scalar must be 'last', for (x, y, z, w), or 'first', for (w, x, y, z), got {scalar!r}")
+def check_quaternion_order(scalar_position: str) -> None:
+    """Raise InputError unless the position of the real part of quaternions is "last" or "first"."""
+    if scalar_position not in ("last", "first"):
+        raise InputError(
+            f"scalar must be 'last', for (x, y, z, w), or 'first', for (w, x, y, z), got {scalar_position!r}"
+        )
 
 
 def _matrices_of_quaternions(quaternion, scalar: str) -> np.ndarray | jax.Array:
-    check_scalar_place(scalar)
+    """Return the rotation matrices, shape (..., 3, 3), of unit quaternions, shape (..., 4)."""
+    check_quaternion_order(scalar)
     q: Any = checked_numbers(quaternion, "a quaternion")
     if q.shape[-1:] != (4,):
         raise InputError(f"a quaternion must have shape (..., 4), got {q.shape}")
@@ -203,7 +206,8 @@ def _matrices_of_quaternions(quaternion, scalar: str) -> np.ndarray | jax.Array:
 
 
 def _matrices_of_euler_angles(euler, sequence: str, degrees: bool) -> np.ndarray | jax.Array:
-    axes = checked_sequence(sequence)
+    """Return the rotation matrices, shape (..., 3, 3), of Euler angles about the axes of a sequence."""
+    axes = axis_indices_of_sequence(sequence)
     angles: Any = checked_numbers(euler, "Euler angles")
     if len(axes) == 1 and angles.shape[-1:] != (1,):
         angles = angles[..., None]
@@ -223,8 +227,8 @@ def _matrices_of_euler_angles(euler, sequence: str, degrees: bool) -> np.ndarray
     return result
 
 
-def checked_sequence(sequence: str) -> list[int]:
-    """Return the indices of the axes of a sequence of Euler angles.
+def axis_indices_of_sequence(sequence: str) -> list[int]:
+    """Return the indices of the rotation axes, 0 to 2, that a sequence such as "zyx" names.
 
     Raises
     ------
@@ -243,7 +247,7 @@ def checked_sequence(sequence: str) -> list[int]:
 
 
 def _elementary_rotation(xp: Any, axis: int, angle) -> Any:
-    """Return the rotations about a coordinate axis, shape (..., 3, 3)."""
+    """Return the rotation matrices about a coordinate axis by angles, shape (..., 3, 3)."""
     c, s, one, zero = xp.cos(angle), xp.sin(angle), xp.ones_like(angle), xp.zeros_like(angle)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     entries = [[zero] * 3 for _ in range(3)]

@@ -23,12 +23,12 @@ from ..functions.newton import nan_unless_small, newton_iterate
 from ..functions.time_span import LastArgumentIgnored, required_argument_count
 from ..tracing.interpret import evaluate_at_points
 from .evolution import join_arguments, state_space
-from .herglotz import VelocityContactSystem, random_states
+from .herglotz import VelocityContactSystem, random_velocity_states
 from .ledger import LEDGER_DIM, FlattenedFunction, ForcesAndHeat, LedgerSystem
 
 
 class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
-    """A simple closed system: a Lagrangian L(q, v, S), friction, an external force and heat from outside [GBY 2.4].
+    """A simple closed system of a Lagrangian L(q, v, S), with friction, external force and heat [GBY 2.4].
 
     ``d/dt L_v - L_q = F_ext + F_fr`` and ``T S' = P_H - F_fr . v``, ``T = -L_S > 0``, on R^n or a manifold. The energy
     ``E = v . L_v - L`` changes by the work and heat received, ``E' = F_ext . v + P_H``, and the entropy production
@@ -81,7 +81,7 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
         Q, where it is not R^n.
     """
 
-    production_name: ClassVar[str] = "dS/dt"
+    entropy_production_name: ClassVar[str] = "dS/dt"
 
     def __init__(
         self,
@@ -99,7 +99,7 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
         shape = (dim // 2,) if space is None else space.shape
         at = f"(q, v, S), q and v of shape {shape}"
         forces = self._set_forces(friction, external, heat_power, (shape, shape, ()), at)
-        self._assemble(structure, dim, energy, forces, momentum_maps, validate, self._state_space(space))
+        self._build_with_ledger(structure, dim, energy, forces, momentum_maps, validate, self._state_space(space))
 
     def _state_space(self, space: mf.Space | None) -> mf.Space | None:
         return state_space(space, LEDGER_DIM if self.has_ledger else 0)
@@ -108,7 +108,7 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
 
     @property
     def contact(self) -> mf.LagrangianContact:
-        return cast(mf.LagrangianContact, cast(mf.Cosymplectic, self.structure).contact)
+        return cast(mf.LagrangianContact, cast(mf.Cosymplectic, self.poisson_without_ledger).contact)
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -122,26 +122,26 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
         return self.contact.tangential_part(q, v)
 
     def legendre(self, x) -> jax.Array:
-        """Return the Legendre transform ``(q, L_v, S)`` of a state or a batch of states, shape (..., 2n + 1)."""
-        return jnp.vectorize(self.contact.legendre, signature="(n)->(n)")(self.drop_ledger(x))
+        """Return states (q, L_v, S), shape (..., 2n + 1), the Legendre transform of states (q, v, S)."""
+        return jnp.vectorize(self.contact.legendre, signature="(n)->(n)")(self.states_without_ledger(x))
 
     def temperature_at(self, y) -> jax.Array:
         return -self.lagrangian.gradient(y)[-1]
 
     def mechanical_energy(self, x) -> jax.Array:
-        """Return the energy ``E = v·L_v - L`` of states, without the ledger, shape (...)."""
-        return jnp.vectorize(self.contact.energy, signature="(n)->()")(self.drop_ledger(x))
+        """Return the energy ``E = v·L_v - L`` of states without their ledger, shape (...)."""
+        return jnp.vectorize(self.contact.energy, signature="(n)->()")(self.states_without_ledger(x))
 
     own_energy = mechanical_energy  # its name in 0.2
 
     # -- the functions, at one point ----------------------------------------------------------------------------------
 
     def lagrangian_value(self, q, v, S) -> jax.Array:
-        """Return the Lagrangian ``L(q, v, S)``, shape ()."""
+        """Return the value of the Lagrangian L(q, v, S) at one point, shape ()."""
         return self.lagrangian.value(jnp.concatenate([q, v, jnp.reshape(S, 1)]))
 
     def momentum(self, q, v, S) -> jax.Array:
-        """Return the momentum ``L_v``, shape (n,)."""
+        """Return the momentum ``L_v`` at one point, shape (n,)."""
         return jax.grad(self.lagrangian_value, argnums=1)(q, v, S)
 
     def momentum_jacobians(self, x) -> tuple[jax.Array, jax.Array]:
@@ -153,7 +153,7 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
 
 
 def join_lagrangian_arguments(lagrangian, space: mf.Space | None = None):
-    """Return a Lagrangian as a function of one array."""
+    """Return a Lagrangian L(q, v, S) as a function of the state in one array; InputError for L(q, v, S, t)."""
     if callable(lagrangian) and not isinstance(lagrangian, Energy) and required_argument_count(lagrangian) == 4:
         raise InputError(
             "the Lagrangian of a simple closed system must be a function of (q, v, S). Give forces that depend on time "
@@ -208,7 +208,7 @@ class ChetaevSystem(SimpleClosedSystem):
 
     form: SemibasicForm
 
-    production_name: ClassVar[str] = "S'"
+    entropy_production_name: ClassVar[str] = "S'"
 
     def __init__(
         self,
@@ -224,29 +224,29 @@ class ChetaevSystem(SimpleClosedSystem):
         self.friction = self.external = self.heat_power = None
         self.form = SemibasicForm.from_function(eta, (dim // 2,) if space is None else space.shape)
         forces = ForcesAndHeat(law=_find_entropy_law(self.form, structure.contact))
-        self._assemble(structure, dim, energy, forces, momentum_maps, validate, self._state_space(space))
+        self._build_with_ledger(structure, dim, energy, forces, momentum_maps, validate, self._state_space(space))
 
-    def friction_at(self, arguments, T) -> jax.Array:
+    def friction_at_temperature(self, arguments, T) -> jax.Array:
         q, v, S, _ = arguments
         return T * self.tangential_part(q, self.form.force_covector(q, v, S))
 
     def friction_force(self, *arguments) -> jax.Array:
-        """Return the force ``T eta_q / eta_S``, shape (n,), at the arguments (q, v, S, t)."""
-        return self.friction_at(arguments, -jax.grad(self.lagrangian_value, argnums=2)(*arguments[:3]))
+        """Return the friction force ``T eta_q / eta_S``, shape (n,), at the arguments (q, v, S, t)."""
+        return self.friction_at_temperature(arguments, -jax.grad(self.lagrangian_value, argnums=2)(*arguments[:3]))
 
-    def specific_residuals(self, x) -> dict[str, jax.Array]:
-        return super().specific_residuals(x) if self.entropy_law == "nondecreasing" else {}
+    def specific_axiom_residuals(self, x) -> dict[str, jax.Array]:
+        return super().specific_axiom_residuals(x) if self.entropy_law == "nondecreasing" else {}
 
 
 class SemibasicForm(Module):
-    """A semibasic one-form on Q x R: its components as a function of (q, v, S, S'), shape (n + 1,)."""
+    """A semibasic one-form on Q x R, given by its components as a function of (q, v, S, S'), shape (n + 1,)."""
 
     function: Callable
     is_implicit: bool = eqx.field(static=True)
 
     @classmethod
     def from_function(cls, eta, shape: tuple[int, ...]) -> SemibasicForm:
-        """Return the checked form of a user's function, for q and v of a shape."""
+        """Return the one-form of a user's function, checked for q and v of a given shape."""
         if not callable(eta):
             raise InputError(f"eta must be a function of (q, v, S) that returns a one-form, got {eta!r}")
         is_implicit, n = required_argument_count(eta) == 4, math.prod(shape)
@@ -259,7 +259,7 @@ class SemibasicForm(Module):
         return cls(function if checked_result_shapes == (n + 1,) else _UnitEntropyForm(function), is_implicit)
 
     def entropy_rate(self, q, v, S) -> jax.Array:
-        """Return S' with ``eta_q . v + eta_S S' = 0``; NaN if Newton's method finds none."""
+        """Return the rate S', shape (), at which the form vanishes on the motion; NaN if Newton's method fails."""
 
         def residual(s):
             eta = self.function(q, v, S, s)
@@ -273,13 +273,13 @@ class SemibasicForm(Module):
         return nan_unless_small(s, value, CONSTRAINT_RTOL * scale)
 
     def force_covector(self, q, v, S) -> jax.Array:
-        """Return ``eta_q / eta_S``, shape (n,), at (q, v, S) and the S' that belongs to them."""
+        """Return the force per temperature, ``eta_q / eta_S``, shape (n,), at (q, v, S)."""
         eta = self.function(q, v, S, self.entropy_rate(q, v, S) if self.is_implicit else jnp.zeros(()))
         return eta[:-1] / eta[-1]
 
 
 class _UnitEntropyForm(Module):
-    """The components of a form with ``eta_S = 1``, from a function that returns ``eta_q``."""
+    """The components of a one-form with ``eta_S = 1``, computed from a function that returns ``eta_q``."""
 
     function: Callable
 
@@ -288,17 +288,17 @@ class _UnitEntropyForm(Module):
 
 
 def _find_entropy_law(form: SemibasicForm, contact: mf.SplitContact) -> LawName | None:
-    """Return the entropy law of a form, from the sign of its production at random states."""
+    """Return the entropy law of a one-form, from the sign of its entropy production at random states."""
     if is_traced(form):
         return None
-    rates, scales = evaluate_at_points(_entropy_production, form, random_states(contact, N_TEST_STATES))
+    rates, scales = evaluate_at_points(_entropy_production, form, random_velocity_states(contact, N_TEST_STATES))
     if (np.abs(rates) <= PRODUCTION_ROUNDING_RTOL * scales).all():
         return "conserved"
     return "nondecreasing" if (rates >= -PRODUCTION_ROUNDING_RTOL * scales).all() else None
 
 
 def _entropy_production(form: SemibasicForm, x):
-    """Return S', and a scale of the terms that are added up in it."""
+    """Return the entropy production S' at one state, and the size of the terms that are added up in it."""
     n = len(x) // 2
     covector = form.force_covector(x[:n], x[n : 2 * n], x[2 * n])
     return -jnp.dot(covector, x[n : 2 * n]), jnp.abs(covector) @ jnp.abs(x[n : 2 * n])

@@ -51,7 +51,7 @@ It is below 1 only where a spin is turned away from its field, and would vanish 
 
 
 class SpinSystem(TorqueSystem):
-    """Classical spins that precess and are damped, on their own or with baths that take their heat.
+    """Classical spins that precess and are damped, with or without baths that take their heat.
 
     They obey the Landau-Lifshitz equation: ``s_i' = gamma_i s_i x grad_i H`` at every site i, plus damping.
 
@@ -122,7 +122,7 @@ class SpinSystem(TorqueSystem):
         poisson = mf.Spins(self.lattice, ratio=ratio)
         self._build(poisson, poisson.dim, energy, None, dissipation, momentum_maps, validate, baths=baths)
 
-    def energy_of_vectors(self, energy: Energy) -> Energy:
+    def energy_of_flat_states(self, energy: Energy) -> Energy:
         return functions_of_flat_states(energy, (*self.lattice, 3))
 
     @property
@@ -145,7 +145,7 @@ class SpinSystem(TorqueSystem):
 
     @property
     def torque_laws(self) -> TorqueLaws:
-        """Name and laws of torques and powers; no Casimir changes, since a torque ``s x w`` keeps every length."""
+        """Name and effects of torques and powers; every Casimir is kept, because a torque ``s x w`` keeps lengths."""
         name = torque_name((*(self.torque or ()), *self.power))
         return TorqueLaws(name, bool(name), entropy_law="nondecreasing" if self.power else "conserved")
 
@@ -170,13 +170,13 @@ class SpinSystem(TorqueSystem):
     def drop_baths(self):
         return _drop_power(super().drop_baths())
 
-    def solve_at_spins(self, x, dH, dS, noise_rates, others, half_step, k) -> jax.Array | None:
-        """Return the slopes of a step from earlier slopes k, solved at each spin in its present field.
+    def solve_slopes_at_each_spin(self, x, dH, dS, noise_rates, other_noise_velocity, half_step, k) -> jax.Array | None:
+        """Return the slopes of a step, shape (n,), from earlier slopes k, by solving at each spin in its field.
 
         Noise, precession and damping turn s at the angular velocity ``w - gamma dH - lambda s x dH``, w in
-        ``noise_rates``, and damping has the factor ``lambda s . dH`` besides. So ``c u - a x u = r`` with the angle a
-        in the time ``half_step``. The solution is ``u = (c r + a x r + (a . r) a / c) / (c^2 + |a|^2)``, as ``c a . u
-        = a . r``.
+        ``noise_rates``, and damping has the factor ``lambda s . dH`` besides. The velocity ``other_noise_velocity`` is
+        added. So ``c u - a x u = r`` with the angle a in the time ``half_step``. The solution is ``u = (c r + a x r +
+        (a . r) a / c) / (c^2 + |a|^2)``, as ``c a . u = a . r``.
         """
         spins, parts, n = self._spin_structure, _split_damping(self.total_dissipation), self.body_dim
         if spins is None or parts is None:
@@ -188,8 +188,8 @@ class SpinSystem(TorqueSystem):
         v = cross_vectors(rates, s)
         lost_power = -dot_vectors(gradient, v)
         lost_power = lost_power if parts.has_site_baths else jnp.sum(lost_power)
-        entropy_rates = others[n:] + parts.bath_entropy_rates(lost_power, dH, dS, n)
-        v = add_vectors(v, spins.split_covectors(others))
+        entropy_rates = other_noise_velocity[n:] + parts.bath_entropy_rates(lost_power, dH, dS, n)
+        v = add_vectors(v, spins.split_covectors(other_noise_velocity))
         if (external_velocity := self.external_velocity(x, dH)) is not None:
             v = add_vectors(v, spins.split_covectors(external_velocity))
             entropy_rates = entropy_rates + external_velocity[n:]
@@ -201,7 +201,7 @@ class SpinSystem(TorqueSystem):
         return spins.join_state(add_vectors(slopes, u), entropy_rates)
 
     def largest_step(self, x, angle: float = 0.3, boltzmann: float = 0.0, t: float = 0.0) -> float:
-        """Return the step (time) in which no spin turns by more than an ``angle``, in its field or by noise.
+        """Return the largest step (time) in which no spin turns by more than an ``angle``, in its field or by noise.
 
         A spin turns at the rate ``sqrt(ratio^2 + (rate |s|)^2) |grad_i H|`` at most. Noise turns it by angles of the
         variance ``2 k T rate h`` in each component, which is kept below the square of the angle.
@@ -239,7 +239,7 @@ class SpinSystem(TorqueSystem):
         return min(angle / turning_rate if turning_rate else np.inf, angle**2 / diffusion if diffusion else np.inf)
 
     def state_array(self, x, batch: bool = False):
-        """Return the flat state x; x may be the spins alone, shape ``(*sites, 3)``."""
+        """Return x as a checked flat state; x may be the spins alone, shape ``(*sites, 3)``."""
         shape, x_shape = (*self.lattice, 3), np.shape(x)
         if x_shape != (self.dim,) and x_shape[-len(shape) :] == shape and (batch or len(x_shape) == len(shape)):
             x = (x if isinstance(x, jax.Array) else np.asarray(x)).reshape(*x_shape[: -len(shape)], -1)
@@ -257,12 +257,12 @@ class SpinSystem(TorqueSystem):
     def casimirs(self) -> dict[str, Energy]:
         return {SPIN_LENGTHS_NAME: HalfSumOfSquares(math.prod(self.lattice))}
 
-    def casimir_components(self) -> dict[str, dict[str, Energy]]:
+    def casimir_terms(self) -> dict[str, dict[str, Energy]]:
         count = math.prod(self.lattice)
         return {SPIN_LENGTHS_NAME: {f"|s|^2 / 2 at {i + 1}": HalfSquareOfSpin(i) for i in range(count)}}
 
     @property
-    def surface(self) -> SphereLengths:
+    def constraint_surface(self) -> SphereLengths:
         assert self._spin_structure is not None
         return SphereLengths(math.prod(self.lattice), SPIN_LENGTHS_NAME, self._spin_structure.is_component_major)
 
@@ -274,7 +274,7 @@ class SpinSystem(TorqueSystem):
 
 
 class _HeatingSpins(HeatingSites):
-    """Sites with a spin each, in the order of components of a Poisson structure."""
+    """Sites that hold one spin each and heat baths, with components in the order of a Poisson structure."""
 
     def __init__(self, shape: tuple[int, ...], spins: mf.Spins):
         super().__init__(shape)
@@ -288,7 +288,7 @@ class _HeatingSpins(HeatingSites):
 
 
 class ReorderedSystem(NamedTuple):
-    """A system with the components of its states in another order.
+    """A system whose states have their components in another order, with the maps of states and functions.
 
     Attributes
     ----------
@@ -306,7 +306,7 @@ class ReorderedSystem(NamedTuple):
 
 
 def reorder_spins(system: System) -> ReorderedSystem | None:
-    """Return a system of spins with these component by component, the order that is fastest for large states.
+    """Return a spin system with states stored component by component, which is fastest for large states.
 
     None for other systems, and for dissipations that may use the order.
     """
@@ -326,12 +326,14 @@ def reorder_spins(system: System) -> ReorderedSystem | None:
     )
     reorder, restore, pullback = maps
     functions = [pullback(f) for f in (system.energy, *system.momentum_maps.values())]
-    reordered = eqx.tree_at(lambda s: [s.poisson, s.energy, *s.momentum_maps.values()], system, [poisson, *functions])
-    return ReorderedSystem(reordered, reorder, restore, pullback)
+    reordered_system = eqx.tree_at(
+        lambda s: [s.poisson, s.energy, *s.momentum_maps.values()], system, [poisson, *functions]
+    )
+    return ReorderedSystem(reordered_system, reorder, restore, pullback)
 
 
 def _checked_powers(power, baths: HeatBaths) -> tuple[tuple[int, ...], tuple[Callable, ...]]:
-    """Return the indices of the baths that receive power, and their powers as traced functions of the time."""
+    """Return the indices of the baths that receive power, and their powers as traced functions of time."""
     if power is None:
         return (), ()
     if not baths.number:
@@ -354,12 +356,12 @@ def _checked_powers(power, baths: HeatBaths) -> tuple[tuple[int, ...], tuple[Cal
 
 
 def _drop_power(system: Any) -> Any:
-    """Return a system of spins without power for its baths."""
+    """Return a spin system without the power that heats its baths."""
     return replace_fields(system, power=(), powered_baths=()) if system.power else system
 
 
 class _DampingParts(NamedTuple):
-    """The damping of the spins, the heating of baths by it, and the conduction between baths."""
+    """The parts of a dissipation of spins: damping, heating of baths by it, and conduction between baths."""
 
     damping: LandauLifshitz
     heating: Heating | None
@@ -367,15 +369,15 @@ class _DampingParts(NamedTuple):
 
     @property
     def has_site_baths(self) -> bool:
-        """True if the sites heat baths of their own."""
+        """True if every site heats a bath of its own."""
         return self.heating is not None and self.heating.has_site_baths
 
     def temperature_signs(self, T) -> jax.Array | float:
-        """Return the sign of the temperature of the bath that each site heats, for temperatures T, shape (m,)."""
+        """Return the sign of the temperature of the bath that each site heats, from temperatures T, shape (m,)."""
         return 1.0 if self.heating is None else self.heating.temperature_signs(T)
 
     def bath_entropy_rates(self, energy_loss, dH, dS, body_dim: int) -> jax.Array:
-        """Return the growth rates of the entropies of the baths, shape (m,).
+        """Return the growth rates of the entropies of the baths, shape (m,), from the power that the spins lose.
 
         Parameters
         ----------
@@ -394,14 +396,14 @@ class _DampingParts(NamedTuple):
 
 
 def _split_damping(dissipation: Dissipation) -> _DampingParts | None:
-    """Return a dissipation as its damping and its heat conduction between baths, if any; None for another dissipation.
+    """Return the parts of a dissipation of spins; None if it has other summands or classes.
 
     It is None for subclasses, whose force may differ.
     """
     conduction = tuple(term for term in dissipation.terms if type(term) is BathConduction)
-    others = [term for term in dissipation.terms if type(term) is not BathConduction]
-    if len(others) != 1:
+    other_terms = [term for term in dissipation.terms if type(term) is not BathConduction]
+    if len(other_terms) != 1:
         return None
-    heating = others[0] if type(others[0]) is Heating else None
-    damping = others[0] if heating is None else heating.inner
+    heating = other_terms[0] if type(other_terms[0]) is Heating else None
+    damping = other_terms[0] if heating is None else heating.inner
     return _DampingParts(damping, heating, conduction) if type(damping) is LandauLifshitz else None

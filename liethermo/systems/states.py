@@ -18,8 +18,7 @@ from ..tracing.programs import jit_unoptimised
 
 
 def checked_state_array(system: Any, x, batch: bool = False) -> np.ndarray | jax.Array:
-    """Return the state x of a system as an array that ``system.state`` has checked: of JAX if JAX traces x, else of
-    NumPy."""
+    """Return x as a checked state of a system, an array of JAX if JAX traces x, otherwise of NumPy."""
     if not isinstance(x, jax.Array):
         try:
             x = np.asarray(x)
@@ -32,28 +31,28 @@ def checked_state_array(system: Any, x, batch: bool = False) -> np.ndarray | jax
     if system.sites and x.shape[-len(system.shape) :] == system.shape:
         x = x.reshape(*x.shape[: -len(system.shape)], system.dim)
     if x.shape[-1:] != (system.dim,):
-        x = _append_bath_entropies(system, x)
+        x = _append_zero_bath_entropies(system, x)
     if jnp.iscomplexobj(x):
         raise InputError(f"a state must be real, got {x.dtype}. Take its real part if that is meant")
     if x.shape[-1:] != (system.dim,) or (x.ndim > 1 and not batch):
-        expected = f"(..., {system.dim})" if batch else f"({system.dim},)"
+        expected_shape = f"(..., {system.dim})" if batch else f"({system.dim},)"
         if system.sites:
-            shown = ", ".join([*(["..."] if batch else []), *map(str, system.shape)])
-            expected = f"({shown}), or flat {expected}"
-        raise InputError(f"a state of this system must have shape {expected}, got {x.shape}")
+            site_shape = ", ".join([*(["..."] if batch else []), *map(str, system.shape)])
+            expected_shape = f"({site_shape}), or flat {expected_shape}"
+        raise InputError(f"a state of this system must have shape {expected_shape}, got {x.shape}")
     if isinstance(x, jax.core.Tracer):
         return x
     numbers = np.asarray(x, dtype=np.float64)
     if not np.isfinite(numbers).all():
-        where = tuple(int(i) for i in np.argwhere(~np.isfinite(numbers))[0])
-        raise InputError(f"the state is not finite: component {where} is {numbers[where]}")
+        first_bad_index = tuple(int(i) for i in np.argwhere(~np.isfinite(numbers))[0])
+        raise InputError(f"the state is not finite: component {first_bad_index} is {numbers[first_bad_index]}")
     if system.space is not None:
         system.space.point(system.points(numbers))
     return numbers
 
 
-def _append_bath_entropies(system: Any, x) -> np.ndarray | jax.Array:
-    """Append zero entropies of the baths to a state of the body; return any other array unchanged."""
+def _append_zero_bath_entropies(system: Any, x) -> np.ndarray | jax.Array:
+    """Return a state of the body with zero bath entropies appended; any other array unchanged."""
     body = system.drop_baths()
     shape = body.shape if body.space is None else body.space.shape
     if shape == (1, 3) and x.shape == (3,):
@@ -70,7 +69,7 @@ def _append_bath_entropies(system: Any, x) -> np.ndarray | jax.Array:
 
 @with_library_settings
 def evaluate_batch(system: Any, function: Callable, x, t, result_signature: str) -> jax.Array:
-    """Return ``function(system, x)`` for each state of a batch, with the system frozen at the time t of that state.
+    """Return ``function(system, x)`` for each state of a batch, with the system frozen at its time t.
 
     Parameters
     ----------
@@ -106,6 +105,7 @@ def checked_times(system: Any, t) -> jax.Array | None:
 
 
 def _evaluate_batch(system: Any, function: Callable, x, t, result_signature: str) -> jax.Array:
+    """Return ``function(system, x)`` for each state of a batch, traced by JAX operation by operation."""
     if t is None:
         return jnp.vectorize(lambda y: function(system, y), signature=f"(n)->{result_signature}")(x)
     evaluate = jnp.vectorize(lambda y, t: function(system.at_time(t), y), signature=f"(n),()->{result_signature}")
@@ -116,12 +116,12 @@ _evaluate_batch_program = jit_unoptimised(_evaluate_batch)
 """Compiled form of :func:`_evaluate_batch`: one program, where a direct call compiles each operation by itself."""
 
 
-def reshape_to_sites(system: Any, result: Any) -> Any:
-    """Return ``result``, a solution or an ensemble, with its states, shape (..., n), as arrays (..., *sites, d)."""
-    while system.inner is not None:
-        system = system.inner
+def reshape_to_sites(system: Any, solution: Any) -> Any:
+    """Return a solution or an ensemble with its states, shape (..., n), reshaped to (..., *sites, d)."""
+    while system.inner_system is not None:
+        system = system.inner_system
     if not system.sites:
-        return result
-    states = {name: value for name in result.state_fields if (value := getattr(result, name)) is not None}
+        return solution
+    states = {name: value for name in solution.state_fields if (value := getattr(solution, name)) is not None}
     reshaped = {name: value.reshape(*value.shape[:-1], *system.shape) for name, value in states.items()}
-    return dataclasses.replace(result, **reshaped)
+    return dataclasses.replace(solution, **reshaped)

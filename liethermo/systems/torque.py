@@ -25,7 +25,7 @@ from .interface import TorqueLaws
 
 
 class TorqueSystem(System):
-    """A system on which a torque may act from outside, known at a time and perhaps at an attitude.
+    """Base class of systems on which an external torque may act, evaluated at a time and perhaps an attitude.
 
     Attributes
     ----------
@@ -40,11 +40,11 @@ class TorqueSystem(System):
     @property
     @abstractmethod
     def torque_laws(self) -> TorqueLaws:
-        """Name of what acts on the system from outside, and its laws."""
+        """Name and effects of the external torque."""
 
     @property
     def has_fixed_attitude(self) -> bool:
-        """True if an attitude is known at which the torque is taken: see :meth:`at_time`."""
+        """True if the attitude at which the torque is evaluated is known: see :meth:`at_time`."""
         return self.torque_arguments is not None and self.torque_arguments[1] is not None
 
     @property
@@ -79,22 +79,23 @@ class TorqueSystem(System):
 
     @abstractmethod
     def _torque_at(self, x, t, attitude) -> jax.Array:
-        """Return the torque, shape (m,), on the first m components of a state."""
+        """Return the torque, shape (m,), on the first m components of a state x."""
 
     def field(self, x, dH, dS, dL=()):
-        """Return the vector field, the torque added to that of the system without it."""
+        """Return the vector field at x, shape (n,), with the external torque."""
         velocity = self.external_velocity(x, dH)
         field = self.drop_torque()._field_without_torque(x, dH, dS, dL)
         return field if velocity is None else field + velocity
 
     def _field_without_torque(self, x, dH, dS, dL) -> jax.Array:
+        """Return the vector field at x, shape (n,), without the external torque."""
         return super().field(x, dH, dS, dL)
 
 
 def traced_torque_and_argument_counts(
-    given: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | None
+    user_torque: Any, algebra: mf.LieAlgebra, group: mf.MatrixGroup | None
 ) -> tuple[Any, tuple[int, ...]]:
-    """Check a torque and trace its Python functions; return it, and the number of arguments of each of its terms.
+    """Return a torque with its functions checked and traced, and the number of arguments of each term.
 
     Raises
     ------
@@ -102,26 +103,26 @@ def traced_torque_and_argument_counts(
         If it is not a function of t, (t, mu), (t, mu, attitude) or (t, mu, attitude, velocity) to a dual vector; or if
         there is no attitude.
     """
-    if given is None:
+    if user_torque is None:
         return None, ()
-    terms = _torque_terms(given)
+    terms = _torque_terms(user_torque)
     if not terms:
         raise InputError("torque is an empty list: a system without a torque is given None")
-    counts = tuple(map(_checked_argument_count, terms))
-    if max(counts) > MAX_ARGUMENTS_WITHOUT_ATTITUDE and group is None:
+    argument_counts = tuple(map(_checked_argument_count, terms))
+    if max(argument_counts) > MAX_ARGUMENTS_WITHOUT_ATTITUDE and group is None:
         name = torque_name(
-            next(term for term, n in zip(terms, counts, strict=True) if n > MAX_ARGUMENTS_WITHOUT_ATTITUDE)
+            next(term for term, n in zip(terms, argument_counts, strict=True) if n > MAX_ARGUMENTS_WITHOUT_ATTITUDE)
         )
         raise InputError(f"the torque {name} depends on the attitude. Give the system a group, such as group=mf.SO(3)")
     shapes = _argument_shapes(algebra, group)
 
     def evaluate_terms(torque, t, mu, velocity, *g):
         attitude = g[0] if len(g) == 1 else g[0] + 1j * g[1]
-        return [jnp.asarray(value) for value in _evaluate_terms(torque, counts, t, mu, attitude, velocity)]
+        return [jnp.asarray(value) for value in _evaluate_terms(torque, argument_counts, t, mu, attitude, velocity)]
 
-    given = terms if isinstance(given, list) else given
+    user_torque = terms if isinstance(user_torque, list) else user_torque
     try:
-        torque, values = trace_callables_and_result_shapes(given, evaluate_terms, *shapes)
+        torque, values = trace_callables_and_result_shapes(user_torque, evaluate_terms, *shapes)
     except InputError:  # of a torque of the library, which says what it needs
         raise
     except IndexOutOfRangeError as error:
@@ -136,21 +137,21 @@ def traced_torque_and_argument_counts(
                 f"the torque {torque_name(term)} must return real numbers of shape {algebra.shape}, as the momentum "
                 f"has, got {value.dtype} of shape {value.shape}"
             )
-    return torque, counts
+    return torque, argument_counts
 
 
 def _argument_shapes(algebra: mf.LieAlgebra, group: mf.MatrixGroup | None) -> tuple[tuple[int, ...], ...]:
-    """Return the shapes of t, mu, the velocity, and the attitude as one real array, or two of a complex group."""
+    """Return the shapes of the real arguments of a torque: t, mu, velocity, and one or two for the attitude."""
     shape = () if group is None else group.identity.shape
     # real and imaginary parts of complex groups are separate arguments: functions are traced for real arrays
     complex_group = group is not None and jnp.iscomplexobj(group.identity)
     return ((), algebra.shape, algebra.shape, *((shape,) * (2 if complex_group else 1)))
 
 
-def evaluate_torque(torque: Any, counts: tuple[int, ...], t, mu, attitude, velocity) -> jax.Array:
-    """Return the sum of the terms of a torque, with the shape of mu; three components act on the first three of mu."""
+def evaluate_torque(torque: Any, argument_counts: tuple[int, ...], t, mu, attitude, velocity) -> jax.Array:
+    """Return the torque, with the shape of mu: the sum of its terms, of which some act on three components only."""
     total = jnp.zeros_like(mu)
-    for term in _evaluate_terms(torque, counts, t, mu, attitude, velocity):
+    for term in _evaluate_terms(torque, argument_counts, t, mu, attitude, velocity):
         term = jnp.asarray(term)
         total = total + (term if term.shape == mu.shape else jnp.concatenate([term, jnp.zeros(mu.shape[0] - 3)]))
     return total
@@ -158,7 +159,7 @@ def evaluate_torque(torque: Any, counts: tuple[int, ...], t, mu, attitude, veloc
 
 @functools.lru_cache(maxsize=64)
 def begins_with_rotations(algebra: mf.LieAlgebra) -> bool:
-    """Return whether the first three basis elements are rotations, and the others an ideal, as in se(3) and in sums.
+    """Return whether the first three basis elements are rotations and the others an ideal, as in se(3).
 
     The first three components of a velocity are then the angular velocity of a body, whatever it carries.
     """
@@ -171,37 +172,42 @@ def begins_with_rotations(algebra: mf.LieAlgebra) -> bool:
 
 
 def torque_free_components(
-    torque: Any, counts: tuple[int, ...], algebra: mf.LieAlgebra, group: mf.MatrixGroup | None
+    torque: Any, argument_counts: tuple[int, ...], algebra: mf.LieAlgebra, group: mf.MatrixGroup | None
 ) -> tuple[int, ...]:
-    """Return the components of the momentum on which a torque does not act, whatever its parameters.
+    """Return the indices of the momentum components on which a torque never acts, whatever its parameters.
 
     A motor inside a body turns a wheel and changes no component of the angular momentum of the whole.
     """
     if algebra.dim > MAX_UNROLLED_DIM:
         return ()
     shapes = _argument_shapes(algebra, group)
-    return tuple(sorted(vanishing_entry_indices(_torque_of_model, (torque, counts), *shapes)))
+    return tuple(
+        sorted(vanishing_entry_indices(_evaluate_torque_from_real_arguments, (torque, argument_counts), *shapes))
+    )
 
 
-def _torque_of_model(model: tuple, t, mu, velocity, *attitude) -> jax.Array:
-    torque, counts = model
-    g = attitude[0] if len(attitude) == 1 else attitude[0] + 1j * attitude[1]
+def _evaluate_torque_from_real_arguments(torque_and_counts: tuple, t, mu, velocity, *attitude_parts) -> jax.Array:
+    """Return the torque from real arguments: a complex attitude is given as two arrays."""
+    torque, counts = torque_and_counts
+    g = attitude_parts[0] if len(attitude_parts) == 1 else attitude_parts[0] + 1j * attitude_parts[1]
     return evaluate_torque(torque, counts, t, mu, g, velocity)
 
 
 def torque_name(torque: Any) -> str:
-    """Return the name of a torque, for messages and provenances."""
+    """Return the name of a torque, for messages and provenance."""
     if isinstance(torque, list | tuple):
         return " + ".join(map(torque_name, torque))
     return callable_name(torque)
 
 
 def _torque_terms(torque: Any) -> tuple[Callable, ...]:
+    """Return the terms of a torque as a tuple of functions."""
     return tuple(torque) if isinstance(torque, list | tuple) else (torque,)
 
 
-def _evaluate_terms(torque: Any, counts: tuple[int, ...], t, mu, attitude, velocity) -> list:
-    terms, arguments = zip(_torque_terms(torque), counts, strict=True), (t, mu, attitude, velocity)
+def _evaluate_terms(torque: Any, argument_counts: tuple[int, ...], t, mu, attitude, velocity) -> list:
+    """Return the values of the terms of a torque in a list, each called with as many arguments as it takes."""
+    terms, arguments = zip(_torque_terms(torque), argument_counts, strict=True), (t, mu, attitude, velocity)
     return [term(*arguments[:count]) for term, count in terms]
 
 
@@ -213,6 +219,7 @@ MAX_ARGUMENTS = 4
 
 
 def _checked_argument_count(term: Any) -> int:
+    """Return the number of arguments of a term of a torque, 1 to 4; InputError if it cannot be a torque."""
     if not callable(term):
         raise InputError(
             "a torque must be a function of t, of (t, mu) or of (t, mu, attitude), such as "

@@ -19,7 +19,7 @@ from ..dissipation.base import Dissipation, DissipationSum, LiftedDissipation, L
 from ..functions.energy import Energy, Function, Pullback, Quadratic, Sum
 from ..runs.named_parameters import named_parameters, replace_parameters
 from ..systems import LiePoissonSystem, MetriplecticSystem, System
-from ..systems.invariants import find_preserved_names
+from ..systems.invariants import find_preserved_function_names
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ def replace_system_attributes(system: System, **attributes: Any) -> System:
         object.__setattr__(
             changed_system,
             "preserved_labels",
-            find_preserved_names(changed_system) if changed_system.preserved else None,
+            find_preserved_function_names(changed_system) if changed_system.preserved_functions else None,
         )
     return changed_system
 

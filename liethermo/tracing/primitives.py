@@ -11,6 +11,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from manifolds._jaxprs import broadcast, reshape
+
 from . import indexing
 from . import linear_algebra as algebra
 from .builder import (
@@ -281,18 +283,6 @@ def _dot_general(builder, eqn, x, y):
         for entries, column in itertools.product(sparse, columns.tolist()):
             result.append(reduce(builder.add, (builder.mul(a, column[k]) for k, a in entries), zero))
     return scalar_array(result, shape)
-
-
-def broadcast(x, params):
-    """Return an array broadcast by the parameters of ``broadcast_in_dim``."""
-    expanded_shape = np.ones(len(params["shape"]), int)
-    expanded_shape[list(params["broadcast_dimensions"])] = x.shape
-    return np.broadcast_to(x.reshape(expanded_shape), params["shape"])
-
-
-def reshape(x, params):
-    """Return an array reshaped by the parameters of ``reshape``."""
-    return (x if params["dimensions"] is None else x.transpose(params["dimensions"])).reshape(params["new_sizes"])
 
 
 def _iota(builder, eqn):

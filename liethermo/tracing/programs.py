@@ -29,6 +29,7 @@ from manifolds._arrays import is_traced
 from manifolds.errors import warn
 
 from .. import disk
+from .blas_threads import uses_one_blas_thread, with_one_blas_thread
 from .caching import LRUCache
 
 
@@ -228,18 +229,26 @@ MIN_STORED_COMPILE_SECONDS = 0.1
 def _compile_or_load(function: Callable, arguments: tuple, options: dict | None) -> Callable:
     """Return the compiled program of a function of arrays, loaded from the cache on disk or compiled by XLA.
 
-    The cache is found by the text of the program, so it never returns the program of another function. The text has
-    all arguments, also those that the program does not use: without them, programs that use different ones of their
-    arguments, or have unused arguments of different shapes, would have the same text. Programs that call Python, or
-    that run on accelerators or on several devices, are not cached, nor any if JAX's own cache is on: a program that
-    comes from there cannot be written again.
+    On the CPU it runs with one BLAS thread where it factorises small matrices. The cache is found by the text of the
+    program, so it never returns the program of another function. The text has all arguments, also those that the
+    program does not use: without them, programs that use different ones of their arguments, or have unused arguments of
+    different shapes, would have the same text. Programs that call Python, or that run on accelerators or on several
+    devices, are not cached, nor any if JAX's own cache is on: a program that comes from there cannot be written again.
     """
     devices = jax.devices()
     is_cpu = devices[0].platform == "cpu"
     jitted_function = jax.jit(function, keep_unused=True, compiler_options=options if is_cpu else None)
-    if len(devices) > 1 or not is_cpu or getattr(jax.config, "jax_compilation_cache_dir"):  # noqa: B009
+    if len(devices) > 1 or not is_cpu:
         return jitted_function
-    lowered_program = jitted_function.lower(arguments)
+    traced_program = jitted_function.trace(arguments)
+    has_jax_cache = getattr(jax.config, "jax_compilation_cache_dir")  # noqa: B009
+    lowered_program = traced_program.lower()
+    program = lowered_program.compile() if has_jax_cache else _load_or_compile(lowered_program, options)
+    return with_one_blas_thread(program) if uses_one_blas_thread(traced_program.jaxpr.jaxpr) else program
+
+
+def _load_or_compile(lowered_program: Any, options: dict | None) -> Callable:
+    """Load a program from the cache on disk, or compile it and write it there if its compilation takes long."""
     text = lowered_program.as_text()
     if "callback" in text:
         return lowered_program.compile()

@@ -12,12 +12,12 @@ import contextlib
 import functools
 import math
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
+from manifolds._jaxprs import CALL_PRIMITIVES, UNKNOWN_ORIGIN, user_source_line
 from manifolds.matrices import chains
 
 from ..errors import InputError, LiethermoError
@@ -39,12 +39,6 @@ from .searches import aval_dtype, has_matrix_products
 
 MAX_INSTRUCTIONS = 200_000
 """Largest number of instructions of a program: far more than compile in reasonable time."""
-
-UNKNOWN_ORIGIN = "of unknown origin"
-"""Source line of an equation that JAX does not trace back to the user's code."""
-
-PACKAGE_FOLDERS = Path(__file__).parents[1], Path(chains.__file__).parents[1]
-"""Folders of the packages ``liethermo`` and ``manifolds``, whose lines are not the user's."""
 
 
 class UnsupportedPrimitive(LiethermoError):
@@ -581,9 +575,8 @@ def _unroll_scatter(builder, eqn, x, indices, updates):
     return indexing.scatter(entry_builder, eqn, x, indices, updates, combine)
 
 
-CALL_PRIMITIVES = "jit pjit call closed_call core_call custom_jvp_call custom_vjp_call checkpoint remat remat2"
 CONTROL_FLOW_RULES = {
-    **dict.fromkeys(CALL_PRIMITIVES.split(), _unroll_call_equation),
+    **dict.fromkeys(CALL_PRIMITIVES, _unroll_call_equation),
     "custom_linear_solve": _unroll_linear_solve,
     chains.chain_p.name: _unroll_divided_difference_chain,
     "cond": _unroll_cond,
@@ -591,17 +584,3 @@ CONTROL_FLOW_RULES = {
     "scatter": _unroll_scatter,
     "while": _unroll_while_loop,
 }
-
-
-def user_source_line(eqn) -> str:
-    """Return the innermost line of the user's code that led to an equation."""
-    for frame in getattr(eqn.source_info.traceback, "frames", ()):
-        path = Path(frame.file_name)
-        if is_user_file(path):
-            return f"{path.name}:{frame.line_num}, in {frame.function_name}"
-    return UNKNOWN_ORIGIN
-
-
-def is_user_file(path: Path) -> bool:
-    """Return whether a file is the user's, and not part of this library, JAX or equinox."""
-    return not {"jax", "jaxlib", "equinox"} & set(path.parts) and not any(map(path.is_relative_to, PACKAGE_FOLDERS))

@@ -20,8 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
+from manifolds._jaxprs import CALL_PRIMITIVES, user_source_line
+
 from ..errors import InputError
-from .scalarize import user_source_line
 
 
 class TaylorSeriesError(InputError):
@@ -530,11 +531,6 @@ def _scan_rule(recurrences: _Recurrences, eqn, values) -> list:
         for column in zip(*row_outputs, strict=True)
     ]
 
-
-CALL_PRIMITIVES = set(
-    "jit pjit call closed_call core_call custom_jvp_call custom_vjp_call checkpoint remat remat2".split()
-)
-"""Primitives that call a jaxpr."""
 
 NONSMOOTH_PRIMITIVES = set(
     "abs sign floor ceil round max min clamp rem reduce_max reduce_min cummax cummin argmax argmin sort".split()

@@ -11,8 +11,9 @@ import numpy as np
 from jax.extend.core import Jaxpr
 from jax.extend.core.primitives import convert_element_type_p
 
+from manifolds._jaxprs import is_user_file, user_source_line
+
 from ..errors import FunctionError
-from .scalarize import is_user_file, user_source_line
 from .searches import iterate_equations
 
 TRACE_ERRORS = (TypeError, ValueError, IndexError, AttributeError)

@@ -21,8 +21,9 @@ import numpy as np
 
 from .._arrays import first_nonfinite_index, first_true_index, format_index, is_traced, real_components, square_matrices
 from .._class_members import ListedType
+from .._index_check import check_indices
 from ..algebras.lie_algebra import LieAlgebra
-from ..errors import ComponentError, DomainError, LieAlgebraError
+from ..errors import ComponentError, DomainError, IndexOutOfRangeError, LieAlgebraError
 from ..matrices.exponential import CAYLEY_CONDITION_LIMIT, HALF_TURN_MARGIN, cayley_of
 from ..matrices.linear import inverse, max_abs_entry, solve
 from . import closed_forms as closed
@@ -470,7 +471,14 @@ def _batched_defect(defect: Callable, name: str, basis: np.ndarray) -> Callable:
 
     def output_shape(batch: tuple[int, ...]) -> tuple[int, ...] | None:
         try:
-            return np.shape(jax.eval_shape(defect, jax.ShapeDtypeStruct((*batch, *basis.shape[1:]), basis.dtype)))
+            g = jax.ShapeDtypeStruct((*batch, *basis.shape[1:]), basis.dtype)
+            closed_jaxpr, result = jax.make_jaxpr(defect, return_shape=True)(g)
+            check_indices(closed_jaxpr, f"the defect of the group {name}")
+            return np.shape(result)
+        except IndexOutOfRangeError:
+            if batch:  # a function of one matrix
+                return None
+            raise
         except (TypeError, ValueError, IndexError):
             return None
 

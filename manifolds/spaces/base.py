@@ -111,7 +111,8 @@ class Space(SpaceMaps):
         x = self._ambient_array(x, "x")
         y = self._call_compiled("_project", x)
         if (index := first_nonfinite_index(y, len(self.shape))) is not None:
-            raise DomainError(f"{self.name}: no point of the space is nearest to x{format_index(index)}")
+            reason = self._why_overflow(np.asarray(x)[index]) or "no point of the space is nearest to it"
+            raise DomainError(f"{self.name}: x{format_index(index)} cannot be projected: {reason}")
         return y
 
     def random(self, key_or_seed, size: tuple[int, ...] = ()) -> jax.Array:
@@ -233,8 +234,18 @@ class Space(SpaceMaps):
 
     def exp(self, x, v) -> jax.Array:
         """Return the point at time 1 of the geodesic from x with velocity v, shape ``(..., *shape)``: Riemannian
-        exponential."""
-        return self._call_compiled("_exp", *self._checked_point_and_vectors(x, v=v))
+        exponential.
+
+        Raises
+        ------
+        DomainError
+            If the point, or its computation, exceeds the range of double precision.
+        """
+        x, v = self._checked_point_and_vectors(x, v=v)
+        y = self._call_compiled("_exp", x, v)
+        if (index := first_nonfinite_index(y, len(self.shape))) is not None:
+            raise DomainError(f"{self.name}: exp(x, v){format_index(index)} exceeds the range of double precision")
+        return y
 
     def log(self, x, y) -> jax.Array:
         """Return the v of least length with ``exp(x, v) = y``, a tangent vector at x: the Riemannian logarithm.
@@ -337,6 +348,8 @@ class Space(SpaceMaps):
             residual, values = np.asarray(self._call_compiled("_residual", x)), np.asarray(x)
         if (index := first_true_index(~(residual <= tolerance))) is not None:
             largest_residual = float(residual[index])
+            if reason := self._why_overflow(values[index]):
+                raise DomainError(f"{self.name}: {label}{format_index(index)} cannot be used: {reason}")
             raise OffManifoldError(
                 f"{self.name}: {label}{format_index(index)} is off the space: "
                 f"{self._why_off_space(values[index], largest_residual)}, tolerance {tolerance:.0e}; "
@@ -348,6 +361,10 @@ class Space(SpaceMaps):
 
     def _why_off_space(self, x: np.ndarray, residual: float) -> str:
         return f"residual {residual:.3g}" if np.isfinite(x).all() else "residual nan, as it is not finite"
+
+    def _why_overflow(self, x: np.ndarray) -> str:
+        """Return why the maps of the space overflow at a finite array x; an empty text if they do not."""
+        return ""
 
     def _checked_point_and_vectors(self, x, name: str = "x", **vectors) -> list[jax.Array]:
         """Return the point and the vectors, after checking that each vector is tangent at the point."""

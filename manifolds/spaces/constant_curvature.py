@@ -252,7 +252,8 @@ class Hyperbolic(Space):
     All maps have closed forms. A point at distance r from the apex (1, 0, ..., 0) has coordinates of the size e^r, so
     its position, and with it a distance, is known to about 1e-16 e^r. From r = 35 on, this is more than the unit of
     length: directions from the apex that agree to rounding are taken as equal there, so that points on one ray have the
-    difference of their radii as distance, up to r = 350. Vectors at a point, and geodesics with given velocities, are
+    difference of their radii as distance. Points with r > 354 are refused, since squares of coordinates overflow.
+    Vectors at a point, and geodesics with given velocities, are
     known to about 1e-16 e^(2r): keep the states of interest near the apex.
     """
 
@@ -277,6 +278,7 @@ class Hyperbolic(Space):
     def _residual(self, x):
         square = (x**2).sum(axis=-1)
         residual = jnp.abs(1.0 + _minkowski_product(x, x)[..., 0]) / (2.0 * square)
+        residual = jnp.where(jnp.abs(x).max(axis=-1) <= _MAX_COORDINATE, residual, jnp.nan)
         return jnp.where(x[..., 0] > 0, residual, jnp.where(jnp.isfinite(square), jnp.inf, jnp.nan))
 
     def _project(self, x):
@@ -369,10 +371,24 @@ class Hyperbolic(Space):
     def _midpoint(self, x, y):
         return self._project((x + y) / jnp.sqrt(4.0 + self._squared_chord(x, y)))
 
+    def _why_overflow(self, x):
+        size = float(np.abs(x).max())
+        if not _MAX_COORDINATE < size < math.inf:
+            return ""
+        return (
+            f"it is {math.log(size) + math.log(2.0):.4g} from the apex or farther, where squares of coordinates "
+            f"overflow. Use points within {_MAX_RADIUS:g} of the apex"
+        )
+
     def _transport(self, x, v, u):
         z = _minkowski_product(v, v)
         return u + _minkowski_product(v, u) * (hyperbolic_stumpff(2, z) * v + hyperbolic_stumpff(1, z) * x)
 
+
+_MAX_RADIUS = 354.0
+"""Distance from the apex up to which squares of coordinates, and sums of two of them, do not overflow."""
+
+_MAX_COORDINATE = math.cosh(_MAX_RADIUS)
 
 _MIN_FAR_COSH = 2.0
 """Smallest cosh of the radius of points whose directions from the apex are computed."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from .._arguments import checked_size
 from .._content_keys import FrozenFunction
-from ..errors import DomainError, ParameterError, SpaceError
+from ..errors import DomainError, IndexOutOfRangeError, ParameterError, SpaceError
 from ..matrices.linear import solve_near_identity
 from .base import MEMBERSHIP_TOLERANCE, Space, register
 from .maps import inner_by_flat
@@ -78,17 +78,24 @@ class LevelSet(Space):
         sizes = tuple(checked_size(n, 1, "LevelSet(constraints, shape)", "a size") for n in sizes)
         for field, value in (("sizes", sizes), ("name", name)):
             object.__setattr__(self, field, value)
-        try:
-            frozen = tuple(FrozenFunction(function, sizes) for function in functions)
-        except (TypeError, ValueError, IndexError, AttributeError) as error:
-            raise SpaceError(f"{name}: its constraints take no array of shape {sizes}: {error}") from None
+        labels = [f"constraint {i}" for i in range(len(functions))] if len(functions) > 1 else ["constraints"]
+        frozen = tuple(map(self._frozen_function, functions, labels))
         object.__setattr__(self, "constraints", frozen)
         if callable(metric):
-            metric = FrozenFunction(metric, sizes)
+            metric = self._frozen_function(metric, "metric")
         object.__setattr__(
             self, "form", metric if metric is None or callable(metric) else _ConstantMetric.from_matrix(metric, self)
         )
         self._check_constraints()
+
+    def _frozen_function(self, function: Callable, label: str) -> FrozenFunction:
+        """Return a function of the user as one that was traced for the shape of a point."""
+        try:
+            return FrozenFunction(function, self.sizes)
+        except IndexOutOfRangeError as error:
+            raise SpaceError(str(error.with_function(f"{self.name}: the function {label}"))) from None
+        except (TypeError, ValueError, IndexError, AttributeError) as error:
+            raise SpaceError(f"{self.name}: {label} must take an array of shape {self.sizes}: {error}") from None
 
     def _check_constraints(self) -> None:
         """Raise an error unless the constraints define a manifold and the metric has the right shape."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from .._arrays import is_traced
 from .._class_members import ListedABCMeta
+from .._index_check import check_indices
 from ..errors import SpaceError
 from ..matrices.linear import solve_near_identity
 
@@ -358,7 +359,12 @@ Up to it compilation takes longer than the run, as long as the kernel is called 
 
 
 def _call_method(space: SpaceMaps, method_name: str, static: tuple, *arrays) -> Any:
-    return getattr(space, method_name)(*arrays, *static)
+    method = getattr(space, method_name)
+    if type(space).__module__.partition(".")[0] not in ("manifolds", "liethermo"):  # a space of the user's own
+        check_indices(
+            jax.make_jaxpr(lambda *arrays: method(*arrays, *static))(*arrays), f"{method_name} of {space.name}"
+        )
+    return method(*arrays, *static)
 
 
 run_kernel = jax.jit(_call_method, static_argnums=(0, 1, 2))

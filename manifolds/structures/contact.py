@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from .._arrays import real_components
+from .._index_check import check_indices
 from .._pytree_module import Module
 from ..errors import ParameterError, ShapeError
 from ..matrices.linear import determinant, inverse, solve
@@ -148,7 +149,10 @@ class ContactForm(ContactStructure):
     def __init__(self, function: Callable, dim: int):
         if not isinstance(dim, int) or dim < 3 or dim % 2 == 0:
             raise ParameterError(f"dim must be odd and at least 3, the number 2n + 1 of coordinates, got {dim!r}")
-        shape = jax.eval_shape(lambda x: jnp.asarray(function(x)), jax.ShapeDtypeStruct((dim,), jnp.float64)).shape
+        x = jax.ShapeDtypeStruct((dim,), jnp.float64)
+        closed_jaxpr, result = jax.make_jaxpr(lambda x: jnp.asarray(function(x)), return_shape=True)(x)
+        check_indices(closed_jaxpr, "a contact form")
+        shape = result.shape
         if shape != (dim,):
             raise ShapeError(f"a form on {dim} coordinates must have shape ({dim},), got {shape}")
         self.function, self.size = function, dim

@@ -16,7 +16,7 @@ class Simpson(lt.OneStepMethod):
         weights = jnp.array([1.0, 4.0, 1.0]) / 6.0
         mean = lambda f: weights @ jax.vmap(f.gradient)(points)  # noqa: E731
         dS = None if system.entropy is None else mean(system.entropy)
-        return system.field(points[1], mean(system.energy), dS, tuple(map(mean, system.preserved)))[None]
+        return system.field(points[1], mean(system.energy), dS, tuple(map(mean, system.preserved_functions)))[None]
 
     def increment(self, h, k):
         return h * k[0]

@@ -50,15 +50,15 @@ RUN_SIGNATURE = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)
 """C signature of ``run(description)``."""
 
 
-class ShortRun:
-    """All steps of a run of one trajectory by one call, which returns whether they were taken.
+class RunInOneCall:
+    """All steps of a run of one trajectory, taken by one call of machine code.
 
     Parameters
     ----------
     addresses : dict from str to int
         The fields ``parameters``, ``block``, ``n_done``, ``status``, ``h`` and ``saved`` of :data:`FIELD_TYPES`.
     segments : sequence of (h, n_steps)
-    increments : sequence of array
+    noise_increments : sequence of array
         Increments of noise for each segment.
     """
 
@@ -70,18 +70,18 @@ class ShortRun:
         self._arrays = sizes, counts, noise_increments, pointers
         arrays = {"sizes": sizes, "counts": counts, "increments": pointers}
         self._fields = np.zeros(len(FIELD_TYPES), dtype=np.int64)
-        known = addresses | {name: array.ctypes.data for name, array in arrays.items()} | {"n_segments": len(sizes)}
-        for name, value in known.items():
+        field_values = (
+            addresses | {name: array.ctypes.data for name, array in arrays.items()} | {"n_segments": len(sizes)}
+        )
+        for name, value in field_values.items():
             self._fields[list(FIELD_TYPES).index(name)] = value
         self._newton = list(FIELD_TYPES).index("newton")
         self._functions: tuple[Any, ...] = ()
-        self._address, self._run = (
-            self._fields.ctypes.data,
-            RUN_SIGNATURE(_compile_short_run_function().function_address("run")),
-        )
+        self._address = self._fields.ctypes.data
+        self._run = RUN_SIGNATURE(_compile_run_in_one_call().function_address("run"))
 
     def __call__(self, loop_functions: tuple[Any, Any], newton_address: int) -> bool:
-        """Take all steps by ``begin`` and ``advance``; return False if one fails or needs Newton's method."""
+        """Take all steps of the run, and return whether every step was taken without Newton's method."""
         if loop_functions != self._functions:
             self._functions = loop_functions
             self._fields[:2] = [ctypes.cast(function, ctypes.c_void_p).value or 0 for function in loop_functions]
@@ -91,8 +91,8 @@ class ShortRun:
 
 
 @functools.cache
-def _compile_short_run_function() -> MachineCode:
-    """Compile ``run(description)``, which returns 1 if a step fails or needs Newton's method, and otherwise 0."""
+def _compile_run_in_one_call() -> MachineCode:
+    """Return the machine code of ``run(description)``: 1 if a step fails or needs Newton's method, otherwise 0."""
     module = ir.Module("run")
     description = ir.LiteralStructType(FIELD_TYPES.values()).as_pointer()
     function = ir.Function(module, ir.FunctionType(INT64, [description]), "run")
@@ -119,7 +119,9 @@ def _compile_short_run_function() -> MachineCode:
 
 
 class CompiledEngine:
-    """Compiled engine for one system and method; its steps are those of the array engine.
+    """The compiled engine, which runs machine code on the CPU, for one system and method.
+
+    Its steps are those of the array engine.
 
     Raises
     ------
@@ -139,65 +141,71 @@ class CompiledEngine:
 
     @functools.cached_property
     def _step_loop(self) -> CompiledStepLoop:
-        """Loop of fixed steps, compiled at its first use: an adaptive run has a loop of its own."""
+        """The compiled loop of fixed steps of this system and method."""
         return cached_step_loop(self._structure, self._parameters, self._method, options=self._options)
 
     def adaptive_step_loop(self, control: StepControl) -> tuple[CompiledStepLoop, np.ndarray]:
-        """Return the step loop of an adaptive run, and its parameters."""
+        """Return the compiled loop of adaptive steps with a step control, and its parameters, shape (p,)."""
         parameters = np.append(self._parameters, flat_parameters(control))
         return cached_step_loop(self._structure, parameters, self._method, control, options=self._options), parameters
 
     @property
     def n_operations(self) -> int:
-        """Number of scalar operations of a step."""
+        """Number of scalar operations of a step, which measures the time to compile it."""
         return self._step_loop.n_operations
 
     @functools.cached_property
     def trajectory(self) -> CompiledTrajectory:
-        """The trajectory of the runs of this engine, in buffers that every run uses again."""
+        """The trajectory that :meth:`start` restarts, in buffers that all runs share."""
         return self.new_trajectory()
 
     def new_trajectory(self) -> CompiledTrajectory:
-        """Return a trajectory in buffers of its own."""
+        """Return a new trajectory with buffers of its own."""
         return CompiledTrajectory(self._step_loop, self._parameters)
 
     def start(self, x) -> CompiledTrajectory:
-        """Return a trajectory that starts at x; it is written over the one that was started before."""
+        """Return the trajectory of this engine, restarted at x, shape (n,)."""
         self.trajectory.start(x, self._planned_steps)
         return self.trajectory
 
     def initial_run_state(self, x) -> State:
+        """Return the state of a run that starts at x, shape (n,)."""
         return self._state_from_block(
             self._step_loop.start_blocks(self._parameters, np.asarray(x, dtype=np.float64)[None], self._planned_steps)
         )
 
     def advance(self, state: State, h, n_saves: int, save_every: int, noise=None):
-        new_state, out = self._run(state, h, n_saves, save_every, noise)
+        """Return the state after up to ``n_saves`` times ``save_every`` steps, and the saved arrays."""
+        new_state, saved_values = self._advance_from_state(state, h, n_saves, save_every, noise)
         is_reached = np.arange(n_saves) < (int(new_state.step) - int(state.step)) // save_every
-        return new_state, (out[:, :-2], out[:, -2], out[:, -1], is_reached)
+        return new_state, (saved_values[:, :-2], saved_values[:, -2], saved_values[:, -1], is_reached)
 
     def step(self, state: State, h, noise=None) -> State:
-        return self._run(state, h, 1, 1, noise)[0]
+        """Return the state after one step of size h, or the old state with a failure status."""
+        return self._advance_from_state(state, h, 1, 1, noise)[0]
 
     def step_ends(self, x: np.ndarray, h: np.ndarray) -> np.ndarray:
+        """Return the states, shape (m, n), after one step of size h from each state of x; NaN if a step fails."""
         blocks = self._step_loop.start_blocks(self._parameters, x)
         self._step_loop.advance_blocks(self._parameters, blocks, h, 1, 1)
         fields = self._step_loop.read_fields(blocks, ("x", "status"))
         return np.where(fields["status"].reshape(-1, 1) == 0.0, fields["x"], np.nan)
 
-    def _run(self, state: State, h, n_saves: int, save_every: int, noise) -> tuple[State, np.ndarray]:
+    def _advance_from_state(self, state: State, h, n_saves: int, save_every: int, noise) -> tuple[State, np.ndarray]:
+        """Return the state after steps from a given state, and the values saved, shape (n_saves, n + 2)."""
         blocks = self._step_loop.block_from_state(state)
-        out = self._step_loop.advance_blocks(
+        saved_values = self._step_loop.advance_blocks(
             self._parameters, blocks, h, n_saves, save_every, None if noise is None else noise[None]
         )[0]
-        return self._state_from_block(blocks), out
+        return self._state_from_block(blocks), saved_values
 
     def _state_from_block(self, blocks: np.ndarray) -> State:
+        """Return the state of a single trajectory from its block."""
         return self._step_loop.state_from_block(blocks)
 
 
 class CompiledTrajectory:
-    """One trajectory in a compiled loop of steps, in buffers that are allocated once.
+    """One trajectory of a compiled step loop, in buffers that machine code writes in place.
 
     The buffers are written in place by the machine code, so each thread needs a trajectory of its own.
 
@@ -239,17 +247,17 @@ class CompiledTrajectory:
             If a step needs Newton's method, which cannot be compiled; the trajectory is then as it was before.
         """
         first_step, block = self._step[0], self._block.copy()
-        out = np.empty((n_saves, self._n_saved_values))
+        saved_values = np.empty((n_saves, self._n_saved_values))
         try:
-            self._take_steps(h, n_saves, steps_per_save, noise, out)
+            self._take_steps(h, n_saves, steps_per_save, noise, saved_values)
         except BaseException:  # an interrupt too: what is not saved was not taken
             self._block[:] = block
             raise
         n_reached = int(self._step[0] - first_step) // steps_per_save
-        return SavedStates(out[:n_reached, :-2], out[:n_reached, -2:])
+        return SavedStates(saved_values[:n_reached, :-2], saved_values[:n_reached, -2:])
 
     def final_state_function(self, segments: Sequence[tuple[float, int]]) -> Callable[[np.ndarray], np.ndarray | None]:
-        """Return the function from an initial state to the final state, shape (n,), with little work besides the steps.
+        """Return a fast function from an initial state, shape (n,), to the final state after all steps of ``segments``.
 
         Its result is None if a step fails, or needs Newton's method for the first time. A call overwrites this
         trajectory.
@@ -259,31 +267,32 @@ class CompiledTrajectory:
         segments : sequence of (h, n_steps)
             Step sizes, and how many steps of each size follow one another.
         """
-        saved, segments = np.empty(self._n_saved_values), tuple(segments)
+        saved_values, segments = np.empty(self._n_saved_values), tuple(segments)
         n_total, loop = sum(n_steps for _, n_steps in segments), self._loop
         increments = [loop.noise_increments_by_lane_block(None, 1, n_steps) for _, n_steps in segments]
         addresses = dict(zip(("parameters", "block", "n_done"), self._addresses, strict=True))
-        fields = {"status": self._status, "h": self._h, "saved": saved}
+        fields = {"status": self._status, "h": self._h, "saved": saved_values}
         addresses |= {name: field.ctypes.data for name, field in fields.items()}
-        take_steps, x_row = ShortRun(addresses, segments, increments), self._x
+        take_steps, x_row = RunInOneCall(addresses, segments, increments), self._x
 
         def final_state(x: np.ndarray) -> np.ndarray | None:
             x_row[:] = x
             return x_row.copy() if take_steps(loop.loop_functions(n_total), loop.newton_address(False)) else None
 
-        final_state.buffer = saved  # type: ignore[attr-defined]  # whose address the run has
+        final_state.buffer = saved_values  # type: ignore[attr-defined]  # whose address the run has
         return final_state
 
     def read(self, name: str) -> float:
-        """Return a scalar field of the state reached so far."""
+        """Return a scalar field of the current state by name."""
         return float(self._row[self._loop.row_slice(name).start])
 
     @property
     def state(self) -> State:
-        """The state reached so far, as a copy."""
+        """A copy of the current state."""
         return self._loop.state_from_block(self._block.copy())
 
-    def _take_steps(self, h: float, n_saves: int, steps_per_save: int, noise: np.ndarray | None, out) -> None:
+    def _take_steps(self, h: float, n_saves: int, steps_per_save: int, noise: np.ndarray | None, saved_values) -> None:
+        """Take ``n_saves * steps_per_save`` steps in place, fewer if one fails, and write the saves to an array."""
         n_steps = n_saves * steps_per_save
         increments = self._loop.noise_increments_by_lane_block(None if noise is None else noise[None], 1, n_steps)
         parameters, block, n_done = self._addresses
@@ -291,7 +300,7 @@ class CompiledTrajectory:
         _, advance = self._loop.loop_functions(n_steps)
         newton, out_address, noise_address = (
             self._loop.newton_address(False),
-            out.ctypes.data,
+            saved_values.ctypes.data,
             increments.ctypes.data,
         )
         while (
@@ -302,7 +311,7 @@ class CompiledTrajectory:
 
 
 class CompiledBatch:
-    """Trajectories in lanes with steps of given sizes, the counterpart of :class:`..array_engine.ArrayBatch`.
+    """Trajectories in the lanes of a compiled step loop, advanced by steps of given sizes.
 
     Parameters
     ----------
@@ -320,8 +329,10 @@ class CompiledBatch:
     def advance(self, h, n_saves: int, steps_per_save: int, noise=None) -> np.ndarray:
         """Take ``n_saves * steps_per_save`` steps; return states, energies and entropies, shape (B, n_saves, n + 2)."""
         sizes = np.resize(h, len(self._blocks) * self._loop.lanes) if np.ndim(h) else h
-        saved = self._loop.advance_blocks(self._first_parameters, self._blocks, sizes, n_saves, steps_per_save, noise)
-        return np.asarray(saved)[: self._n_trajectories]
+        saved_values = self._loop.advance_blocks(
+            self._first_parameters, self._blocks, sizes, n_saves, steps_per_save, noise
+        )
+        return np.asarray(saved_values)[: self._n_trajectories]
 
     def read(self, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """Return copies of fields of the trajectories by name, by default of all fields."""
@@ -330,7 +341,7 @@ class CompiledBatch:
 
 
 class CompiledAdaptiveRuns:
-    """Adaptive runs of trajectories in lanes, the counterpart of :class:`..adaptive_runs.ArrayAdaptiveRuns`.
+    """Adaptive runs of trajectories in the lanes of a compiled step loop.
 
     Parameters
     ----------
@@ -354,37 +365,45 @@ class CompiledAdaptiveRuns:
         self.blocks = step_loop.start_blocks(parameters, x, 0, **initial_fields)
 
     def advance(self, max_attempts: int) -> None:
+        """Make up to ``max_attempts`` attempts of a step in each trajectory, fewer if it pauses."""
         self.step_loop.advance_blocks(self.first_parameters, self.blocks, 0.0, 1, max_attempts)
 
     def state_of_only_trajectory(self) -> State:
+        """Return the state of the only trajectory."""
         return self.step_loop.state_from_block(self.blocks.copy())
 
     def record_attempts(self, max_attempts: int) -> dict[str, np.ndarray]:
-        """Make up to ``max_attempts`` attempts of the only trajectory and return their records: see ATTEMPT_FIELDS."""
-        n_before, out = self.read("n_attempts")[0], np.empty((1, max_attempts, self.step_loop.n_saved_values))
+        """Make up to ``max_attempts`` attempts of the only trajectory; return the records by ATTEMPT_FIELDS."""
+        n_before, saved_values = self.read("n_attempts")[0], np.empty((1, max_attempts, self.step_loop.n_saved_values))
         try:
-            self.step_loop.advance_blocks(self.first_parameters, self.blocks, 0.0, max_attempts, 1, out=out)
+            self.step_loop.advance_blocks(self.first_parameters, self.blocks, 0.0, max_attempts, 1, out=saved_values)
         except UnsupportedPrimitive:
             if self.read("n_attempts")[0] == n_before:
                 raise
-        return self.step_loop.saved_fields_of_single_trajectory(out[0, : int(self.read("n_attempts")[0] - n_before)])
+        return self.step_loop.saved_fields_of_single_trajectory(
+            saved_values[0, : int(self.read("n_attempts")[0] - n_before)]
+        )
 
-    def read(self, name: str, indices: np.ndarray | slice = slice(None)) -> np.ndarray:
+    def read(self, field_name: str, indices: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Return a field of the chosen trajectories, trajectories first."""
         if isinstance(indices, slice):
-            return self.step_loop.read_fields(self.blocks, (name,))[name][: self.n_trajectories][indices].copy()
-        values = self._lane_values(indices, name)
-        return values if name == "p" else values.reshape(len(indices), *self.step_loop.field_shape(name))
+            return self.step_loop.read_fields(self.blocks, (field_name,))[field_name][: self.n_trajectories][
+                indices
+            ].copy()
+        values = self._lane_values(indices, field_name)
+        return values if field_name == "p" else values.reshape(len(indices), *self.step_loop.field_shape(field_name))
 
-    def write(self, name: str, indices: np.ndarray, values) -> None:
+    def write(self, field_name: str, indices: np.ndarray, values) -> None:
+        """Set a field of the chosen trajectories to values, trajectories first."""
         block, lane = np.divmod(indices, self.step_loop.lanes)
         values = np.reshape(values, (len(indices), -1)) if np.ndim(values) else values
-        self.step_loop.block_rows(self.blocks, name)[block, :, lane] = values
+        self.step_loop.block_rows(self.blocks, field_name)[block, :, lane] = values
 
     def _lane_values(self, indices: np.ndarray, name: str | None = None) -> np.ndarray:
-        """Return a field of the chosen trajectories, or all their rows, shape (trajectories, rows)."""
+        """Return the rows of a field of the chosen trajectories, shape (trajectories, rows); all rows for no name."""
         block, lane = np.divmod(indices, self.step_loop.lanes)
         return self.step_loop.block_rows(self.blocks, name)[block, :, lane]
 
-    def keep_only(self, indices: np.ndarray) -> None:
-        """Drop all trajectories except the chosen ones."""
+    def keep_trajectories(self, indices: np.ndarray) -> None:
+        """Drop all trajectories except the chosen ones, and pack these into new blocks."""
         self.blocks, self.n_trajectories = self.step_loop.blocks_from_rows(self._lane_values(indices)), len(indices)

@@ -44,7 +44,7 @@ SPECIAL_FUNCTIONS = {
 
 @functools.cache
 def bind_scipy_functions_in_llvm() -> None:
-    """Bind the names of SciPy's exported functions in LLVM."""
+    """Bind the functions that SciPy exports to their names in LLVM, so that machine code can call them."""
     import scipy.linalg.cython_lapack
     import scipy.special.cython_special
 
@@ -60,7 +60,7 @@ def bind_scipy_functions_in_llvm() -> None:
 
 
 def find_or_write_kernel(writer: Any, call: LapackCall) -> ir.Function:
-    """Return the function ``kernel(inputs, outputs)`` that computes a LAPACK call for one lane.
+    """Return the LLVM function ``kernel(inputs, outputs)`` of a LAPACK call in one lane, written at first use.
 
     The arrays interleave the lanes: consecutive entries are ``writer.lanes`` numbers apart.
 
@@ -77,7 +77,10 @@ def find_or_write_kernel(writer: Any, call: LapackCall) -> ir.Function:
 
 
 class _KernelWriter:
-    """Writer of a LAPACK kernel. Its matrices are stored by columns, complex numbers as real and imaginary part."""
+    """Writer of the LLVM function of one LAPACK call, whose matrices are stored by columns.
+
+    A complex number is stored as its real and its imaginary part.
+    """
 
     def __init__(self, writer: Any, arguments: Sequence[ir.Value], call: LapackCall):
         self.writer, self.call, self.builder = writer, call, writer.builder
@@ -85,6 +88,7 @@ class _KernelWriter:
         self.input_pointer, self.output_pointer = arguments
 
     def write_kernel(self) -> None:
+        """Write the body of the kernel: call LAPACK if all inputs are finite, otherwise return NaN."""
         build, shapes = self.builder, self.call.argument_shapes
         total = sum(map(math.prod, shapes)) * self.parts_per_entry
         all_finite = build.alloca(ir.IntType(1))
@@ -104,6 +108,7 @@ class _KernelWriter:
     # -- the calls ----------------------------------------------------------------------------------------------------
 
     def _write_eigh(self, n: int) -> None:
+        """Write eigenvectors and eigenvalues of a Hermitian matrix of size n."""
         a, w = self._copy_input(0, n, n), self._allocate_doubles(n)
         is_complex, work_size = self.call.is_complex, 34 * n  # workspace of a blocked reduction to tridiagonal form
         arguments = [
@@ -124,6 +129,7 @@ class _KernelWriter:
         self._call_and_write_results_or_nan("zheev" if is_complex else "dsyev", arguments, write_results)
 
     def _write_lu(self, m: int, n: int) -> None:
+        """Write the LU factors and the pivots of an m by n matrix."""
         a, n_pivots = self._copy_input(0, m, n), min(m, n)
         pivots = self._allocate_integers(n_pivots)
         routine = "zgetrf" if self.call.is_complex else "dgetrf"
@@ -144,6 +150,7 @@ class _KernelWriter:
             self.builder.store(self.builder.sitofp(pivot_index, FLOAT64), self._output_entry_pointer(1, i))
 
     def _write_inverse(self, n: int) -> None:
+        """Write the inverse of a matrix of size n."""
         is_complex = self.call.is_complex
         a = self._copy_input(0, n, n)
         rows = self._new_integer_slot(n)
@@ -167,6 +174,7 @@ class _KernelWriter:
         self._call_and_write_results_or_nan("zgetrf" if is_complex else "dgetrf", factorise_arguments, invert)
 
     def _write_qr(self, m: int, n: int, columns: int) -> None:
+        """Write the QR factors of an m by n matrix, with the given number of columns of Q."""
         n_reflectors, width, is_complex = min(m, n), max(n, columns), self.call.is_complex
         a = self._copy_input(0, m, n, width)
         tau = self._allocate_doubles(n_reflectors * self.parts_per_entry)
@@ -211,6 +219,7 @@ class _KernelWriter:
         self._copy_output(1, r, columns, n)
 
     def _write_svd(self, m: int, n: int, full: int) -> None:
+        """Write the singular value decomposition of an m by n matrix, with square factors if ``full``."""
         n_singular, max_dim, is_complex = min(m, n), max(m, n), self.call.is_complex
         n_left, n_right = (m, n) if full else (n_singular, n_singular)
         a, s = self._copy_input(0, m, n), self._allocate_doubles(n_singular)
@@ -241,20 +250,22 @@ class _KernelWriter:
     # -- arrays -------------------------------------------------------------------------------------------------------
 
     def _lane_entry_pointer(self, base: ir.Value, i: ir.Value) -> ir.Value:
+        """Return the pointer to entry i of an array with one number for each lane."""
         return self.builder.gep(base, [self.builder.mul(i, ir.Constant(INT64, self.writer.lanes))])
 
     def _output_entry_pointer(self, result_index: int, i: ir.Value) -> ir.Value:
-        """Return the pointer to entry i of a result."""
+        """Return the pointer to entry i of a result of the kernel."""
         start = sum(self.call.real_entry_counts(self.call.result_specs)[:result_index])
         return self._lane_entry_pointer(self.output_pointer, self.builder.add(i, ir.Constant(INT64, start)))
 
     def _matrix_entry_pointer(self, a: ir.Value, i: ir.Value, j: ir.Value, rows: int) -> ir.Value:
+        """Return the pointer to entry (i, j) of a matrix a in LAPACK's storage, by columns."""
         build = self.builder
         offset = build.add(build.mul(j, ir.Constant(INT64, rows)), i)
         return build.gep(a, [build.mul(offset, ir.Constant(INT64, self.parts_per_entry))])
 
     def _copy_input(self, start: int, m: int, n: int, width: int | None = None) -> ir.Value:
-        """Copy an argument into LAPACK's storage, with room for ``width`` columns."""
+        """Copy an m by n input to new LAPACK storage, with room for ``width`` columns; return its pointer."""
         build, a = self.builder, self._allocate_doubles(m * (width or n) * self.parts_per_entry)
         for i in self._write_loop(m):
             for j in self._write_loop(n):
@@ -268,6 +279,7 @@ class _KernelWriter:
         return a
 
     def _copy_output(self, result_index: int, a: ir.Value, m: int, n: int) -> None:
+        """Copy an m by n matrix from LAPACK's storage to a result of the kernel."""
         build = self.builder
         for i in self._write_loop(m):
             for j in self._write_loop(n):
@@ -280,42 +292,50 @@ class _KernelWriter:
                     )
 
     def _copy_output_vector(self, result_index: int, w: ir.Value, n: int) -> None:
+        """Copy a vector of n doubles to a result of the kernel."""
         for i in self._write_loop(n):
             self.builder.store(self.builder.load(self.builder.gep(w, [i])), self._output_entry_pointer(result_index, i))
 
     def _write_nan(self) -> None:
+        """Write NaN to all results of the kernel."""
         for i in self._write_loop(len(self.call.result_kinds)):
             self.builder.store(ir.Constant(FLOAT64, math.nan), self._lane_entry_pointer(self.output_pointer, i))
 
     # -- what LAPACK is told ------------------------------------------------------------------------------------------
 
     def _allocate(self, value_type: ir.Type, count: int) -> ir.Value:
+        """Return the pointer to new stack memory for ``count`` values of a type."""
         with self.builder.goto_entry_block():
             return self.builder.alloca(value_type, max(count, 1))
 
     def _allocate_doubles(self, count: int) -> ir.Value:
+        """Return the pointer to new stack memory for ``count`` doubles."""
         return self._allocate(FLOAT64, count)
 
     def _allocate_integers(self, count: int) -> ir.Value:
+        """Return the pointer to new stack memory for ``count`` 32-bit integers."""
         return self._allocate(INT32, count)
 
     def _new_integer_slot(self, value: int) -> ir.Value:
+        """Return the pointer to an integer in memory, as Fortran passes arguments."""
         pointer = self._allocate_integers(1)
         self.builder.store(ir.Constant(INT32, value), pointer)
         return pointer
 
     def _new_char_slot(self, letter: str) -> ir.Value:
+        """Return the pointer to a character in memory, as Fortran passes arguments."""
         pointer = self._allocate(INT8, 1)
         self.builder.store(ir.Constant(INT8, ord(letter)), pointer)
         return pointer
 
     def _call_routine(self, name: str, arguments: Sequence[ir.Value]) -> None:
+        """Call a LAPACK routine by name."""
         self.builder.call(
             declare_external_function(self.builder.module, name, ir.VoidType(), [a.type for a in arguments]), arguments
         )
 
     def _call_and_write_results_or_nan(self, name: str, arguments: Sequence[ir.Value], write_results) -> None:
-        """Call a routine whose last argument reports failure, then write its results, or NaN if it failed."""
+        """Call a LAPACK routine, and write its results if it succeeds, otherwise NaN."""
         info = self._allocate_integers(1)
         self._call_routine(name, [*arguments, info])
         is_successful = self.builder.icmp_signed("==", self.builder.load(info), ir.Constant(INT32, 0))
@@ -326,7 +346,7 @@ class _KernelWriter:
                 self._write_nan()
 
     def _write_loop(self, count: int):
-        """Write a loop: the body of the Python ``for`` is written once, with the loop counter."""
+        """Write a loop whose body is that of the Python ``for``; yield its counter."""
         with self.writer.loop_range(ir.Constant(INT64, count)) as i:
             yield i
 
@@ -334,7 +354,7 @@ class _KernelWriter:
 def declare_external_function(
     module: ir.Module, name: str, return_type: ir.Type, argument_types: Sequence[ir.Type]
 ) -> ir.Function:
-    """Declare a function that is bound when the code is loaded."""
+    """Return the LLVM declaration of a function that is bound when the machine code is loaded."""
     name = SYMBOL_PREFIX + name
     if name in module.globals:
         return module.globals[name]

@@ -68,7 +68,7 @@ class ProgramWriter:
         self.active_lanes: ir.Value | None = None
 
     def new_function(self, name: str, argument_types: Sequence[ir.Type]) -> tuple[ir.Function, ProgramWriter]:
-        """Return a new function of the module without a result, and a writer of its body with as many lanes."""
+        """Return a new LLVM function without a result, and a writer of its body."""
         function = ir.Function(self.builder.module, ir.FunctionType(ir.VoidType(), list(argument_types)), name)
         function.linkage = "internal"
         function.attributes.add("noinline")
@@ -77,7 +77,7 @@ class ProgramWriter:
     def write_program_with_double_outputs(
         self, program: Program, read_input: InputReader, find_table: TableFinder | None = None
     ) -> list[list[ir.Value]]:
-        """Write a program and return its outputs as doubles, array by array.
+        """Write a program and return its outputs as doubles, a list for each output array.
 
         Parameters
         ----------
@@ -95,13 +95,13 @@ class ProgramWriter:
     def write_program(
         self, program: Program, read_input: InputReader, find_table: TableFinder | None = None
     ) -> list[list[ir.Value]]:
-        """Write a program and return its outputs, array by array, with integers and truth values unconverted."""
+        """Write a program and return its outputs of their own types, a list for each output array."""
         emitter = _ProgramEmitter(self, program, read_input, find_table)
         emitter.write_instructions_and_branches(sink_instructions_into_branches(program))
         return [[emitter.value_of_operand(a) for a in entries] for entries in program.outputs]
 
     def cast(self, value: ir.Value, kind: str) -> ir.Value:
-        """Convert a value to a kind, "f", "b" or "i"."""
+        """Return a value converted to the type of a kind: "f" double, "b" truth value, "i" integer."""
         if value.type == self.type_of_kind[kind]:
             return value
         if kind == "f":
@@ -111,12 +111,13 @@ class ProgramWriter:
         raise UnsupportedPrimitive("convert_element_type", "of unknown origin", f"from {value.type}")
 
     def constant(self, number: bool | int | float) -> ir.Value:
+        """Return a number as an LLVM constant, the same in every lane."""
         value_type = {bool: self.bool_type, int: self.int_type}.get(type(number), self.double_type)
         value = int(number) if isinstance(number, bool) else number
         return ir.Constant(value_type, value if self.lanes == 1 else [value] * self.lanes)
 
     def write_operation(self, op: str, args: Sequence[ir.Value]) -> ir.Value:
-        """Write one operation, a key of :data:`liethermo.tracing.builder.SYMPY_OPERATIONS`, and return its result."""
+        """Write one operation, named as in :data:`liethermo.tracing.builder.SYMPY_OPERATIONS`; return its result."""
         build, (x, *rest) = self.builder, args
         is_real = x.type == self.double_type
         if op in ARITHMETIC:
@@ -174,7 +175,7 @@ class ProgramWriter:
         raise UnsupportedPrimitive(op, "of unknown origin", f"on {x.type}")
 
     def _integer_quotient(self, x: ir.Value, n: ir.Value) -> ir.Value:
-        """Write the quotient of integers, towards zero; a divisor 0 gives -1, and -1 does not trap."""
+        """Return the quotient of integers, rounded towards zero; -1 for the divisor 0."""
         build, one = self.builder, self.constant(1)
         is_zero, is_minus_one = (build.icmp_signed("==", n, self.constant(c)) for c in (0, -1))
         quotient = build.sdiv(x, build.select(build.or_(is_zero, is_minus_one), one, n))
@@ -185,13 +186,13 @@ class ProgramWriter:
         raise NotImplementedError(f"nothing fills in {n_results} of {len(args)} values here")
 
     def wrap_integer(self, x: ir.Value, bits: int, is_signed: bool) -> ir.Value:
-        """Wrap an integer to the range of ``bits`` bits."""
+        """Return an integer wrapped around to ``bits`` bits, as narrow integers of JAX wrap."""
         narrow_type = ir.IntType(bits) if self.lanes == 1 else ir.VectorType(ir.IntType(bits), self.lanes)
         widen = self.builder.sext if is_signed else self.builder.zext
         return widen(self.builder.trunc(x, narrow_type), self.int_type)
 
     def _call_special_function(self, op: str, args: Sequence[ir.Value]) -> ir.Value:
-        """Call a special function of SciPy for each lane; the last argument is a flag that Cython adds."""
+        """Return the result of a special function of SciPy in each lane."""
         dispatch_flag = ir.Constant(ir.IntType(32), 0)
         argument_types = [FLOAT64] * SPECIAL_FUNCTIONS[op][1] + [dispatch_flag.type]
         function = declare_external_function(self.builder.module, op, FLOAT64, argument_types)
@@ -200,14 +201,14 @@ class ProgramWriter:
     def fused_multiply_add(
         self, op: str, product_index: int, factors: Sequence[ir.Value], terms: Sequence[ir.Value]
     ) -> ir.Value:
-        """Write a sum or difference whose term ``product_index`` is the product of ``factors``, rounded once."""
+        """Return a sum or difference of a product and a term, rounded once."""
         (x, y), addend = factors, terms[1 - product_index]
         if op == "sub":
             x, addend = (x, self.builder.fneg(addend)) if product_index == 0 else (self.builder.fneg(x), addend)
         return self.call_intrinsic("llvm.fmuladd", (x, y, addend), self.double_type)
 
     def nonnegative_max(self, x: ir.Value, y: ir.Value) -> ir.Value:
-        """Write the maximum of two nonnegative numbers, NaN if either is, by comparing their bits."""
+        """Return the maximum of two nonnegative numbers, NaN if either is, by comparing their bits."""
         build, width = self.builder, max(self.lanes, 2)
         double_vector, int_vector = ir.VectorType(FLOAT64, width), ir.VectorType(INT64, width)
         lane_zero = ir.Constant(ir.IntType(32), 0)
@@ -220,7 +221,7 @@ class ProgramWriter:
         return build.extract_element(maxima, lane_zero) if self.lanes == 1 else maxima
 
     def splat(self, number: ir.Value) -> ir.Value:
-        """Copy a number to every lane."""
+        """Return a vector with a number in every lane."""
         if self.lanes == 1:
             return number
         build, zero = self.builder, ir.Constant(ir.IntType(32), 0)
@@ -229,7 +230,7 @@ class ProgramWriter:
         return build.shuffle_vector(first_lane, ir.Constant(self.double_type, ir.Undefined), lane_indices)
 
     def has_true_lane(self, tests: ir.Value) -> ir.Value:
-        """Return one boolean: whether a condition is true in any of the SIMD lanes."""
+        """Return one truth value: whether a condition holds in any lane."""
         if self.lanes == 1:
             return tests
         bits = ir.IntType(self.lanes)
@@ -237,11 +238,12 @@ class ProgramWriter:
 
     @staticmethod
     def int64(n: int) -> ir.Constant:
+        """Return an integer as an LLVM constant of 64 bits."""
         return ir.Constant(INT64, n)
 
     @contextlib.contextmanager
     def loop_while(self, condition: Callable[[], ir.Value]) -> Iterator[None]:
-        """Write a loop around the body of the ``with`` statement, which runs while a condition holds."""
+        """Write a loop whose body is that of the ``with`` statement, and which runs while a condition holds."""
         build = self.builder
         head, body, exit_block = (build.append_basic_block(name) for name in ("head", "body", "after"))
         build.branch(head)
@@ -254,7 +256,7 @@ class ProgramWriter:
 
     @contextlib.contextmanager
     def loop_range(self, count: ir.Value) -> Iterator[ir.Value]:
-        """Write a loop around the body of the ``with`` statement, with a counter from 0 to ``count - 1``."""
+        """Write a loop whose body is that of the ``with`` statement, with a counter from 0 to ``count - 1``."""
         build = self.builder
         with build.goto_entry_block():  # otherwise each pass would take more of the stack
             counter = build.alloca(INT64)
@@ -264,7 +266,7 @@ class ProgramWriter:
             build.store(build.add(build.load(counter), self.int64(1)), counter)
 
     def match_constant_types(self, op: str | Block, values: list[ir.Value], args: Sequence[Scalar]) -> list[ir.Value]:
-        """Convert constants among the operands to the type of the other operands."""
+        """Return operands with constants converted to the type of the other operands."""
         operands = slice(1, None) if op in ("select", "pick") else slice(None)
         types = [v.type for v, a in zip(values[operands], args[operands], strict=True) if isinstance(a, str)]
         for i in range(len(values))[operands]:
@@ -273,24 +275,27 @@ class ProgramWriter:
         return values
 
     def _to_double(self, value: ir.Value) -> ir.Value:
+        """Return an integer or a truth value converted to a double."""
         if value.type == self.double_type:
             return value
         convert = self.builder.uitofp if value.type == self.bool_type else self.builder.sitofp
         return convert(value, self.double_type)
 
     def call_intrinsic(self, name: str, args: Sequence[ir.Value], return_type: ir.Type) -> ir.Value:
+        """Return the result of an LLVM intrinsic function on all lanes at once."""
         suffix = "" if self.lanes == 1 else f"v{self.lanes}"
         kinds = [f"{suffix}i64"] if return_type == self.int_type else []
         name = ".".join([name, *kinds, f"{suffix}f64"])
         return self.builder.call(self._declare_function(name, return_type, args), args)
 
     def call_per_lane(self, name: str, args: Sequence[ir.Value]) -> ir.Value:
+        """Return the results of a scalar function, called once for each lane."""
         return self._apply_per_lane(
             lambda lane_args: self.builder.call(self._declare_function(name, FLOAT64, lane_args), lane_args), args
         )
 
     def _apply_per_lane(self, call: Callable[[Sequence[ir.Value]], ir.Value], args: Sequence[ir.Value]) -> ir.Value:
-        """Apply a scalar call to each lane."""
+        """Return the results of ``call`` on the arguments of each lane."""
         if self.lanes == 1:
             return call(args)
         result = ir.Constant(self.double_type, ir.Undefined)
@@ -301,6 +306,7 @@ class ProgramWriter:
         return result
 
     def _declare_function(self, name: str, return_type: ir.Type, args: Sequence[ir.Value]) -> ir.Function:
+        """Return the LLVM declaration of a function without side effects."""
         module = self.builder.module
         if name in module.globals:
             return module.globals[name]
@@ -312,7 +318,7 @@ class ProgramWriter:
 
 
 class _ProgramEmitter:
-    """Emitter of one program; values written on one side of a branch have a scope of their own."""
+    """Writer of the instructions of one program; each side of a branch has its own scope of values."""
 
     def __init__(
         self, writer: ProgramWriter, program: Program, read_input: InputReader, find_table: TableFinder | None
@@ -328,6 +334,7 @@ class _ProgramEmitter:
         self.tables: dict[Scalar, Table] = {}
 
     def value_of_operand(self, operand: Scalar) -> ir.Value:
+        """Return the LLVM value of a constant or a variable, which is read if it is an input."""
         if not isinstance(operand, str):
             return self.writer.constant(operand)
         if operand not in self.values:
@@ -335,10 +342,11 @@ class _ProgramEmitter:
         return self.values[operand]
 
     def value_or_table_of_operand(self, operand: Scalar) -> Any:
-        """Return a value or a table."""
+        """Return the table with the name of an operand, or else its LLVM value."""
         return self.tables.get(operand) or self.value_of_operand(operand)
 
     def write_instructions_and_branches(self, items: Sequence[Instruction | Branch]) -> None:
+        """Write instructions and branches in order."""
         for item in items:
             if isinstance(item, Branch):
                 self.write_branch(item)
@@ -346,6 +354,7 @@ class _ProgramEmitter:
                 self.write_instruction(item)
 
     def write_instruction(self, instruction: Instruction) -> None:
+        """Write one instruction, and store its result under the name of its target."""
         writer, (target, op, args) = self.writer, instruction
         if isinstance(op, Block):
             self.block_results[target] = write_block(writer, op, [self.value_or_table_of_operand(a) for a in args])
@@ -386,7 +395,7 @@ class _ProgramEmitter:
             self.nonnegative.add(target)
 
     def table_of_inputs(self, names: Sequence[Scalar]) -> Table | None:
-        """Return a table of inputs that are equidistant in memory, without a copy; None if they are not."""
+        """Return inputs that are equidistant in memory as a table, without a copy; None for other inputs."""
         positions = [self.input_positions[a] for a in names if a in self.input_positions]
         if self.find_table is None or len(positions) < max(len(names), 2):
             return None
@@ -400,7 +409,7 @@ class _ProgramEmitter:
         )
 
     def write_branch(self, branch: Branch) -> None:
-        """Write each side of a branch, skipped if no lane takes it, then the choices of each lane."""
+        """Write both sides of a branch, each skipped if no lane takes it, and select results lane by lane."""
         writer, build = self.writer, self.writer.builder
         self.write_instruction(branch.test)
         test = self.values[branch.test.target]
@@ -443,7 +452,7 @@ SERIES_DEGREE = 13
 
 
 def write_exponential(writer: Any, x: ir.Value) -> ir.Value:
-    """Write ``exp(x) = 2^k exp(r)`` with ``x = k log 2 + r``, to one unit in the last place.
+    """Return ``exp(x)``, computed as ``2^k exp(r)`` with ``x = k log 2 + r`` to one unit in the last place.
 
     Parameters
     ----------
@@ -463,6 +472,7 @@ def write_exponential(writer: Any, x: ir.Value) -> ir.Value:
 
 
 def _write_fast_exponential(writer: Any, x: ir.Value) -> ir.Value:
+    """Return ``exp(x)`` for arguments whose exponential is a normal number."""
     build = writer.builder
 
     def multiply_add(a: ir.Value, b: ir.Value, c: ir.Value) -> ir.Value:

@@ -30,7 +30,7 @@ INT64_POINTER = INT64.as_pointer()
 
 
 class NamedProgram(NamedTuple):
-    """A program with the names of the arrays that it reads and writes."""
+    """A program with names for the arrays that it reads and writes."""
 
     program: Program
     arguments: tuple[str, ...]
@@ -38,7 +38,7 @@ class NamedProgram(NamedTuple):
 
 
 class BlockLayout:
-    """Layout of a block: the first row and the number of rows of each array, by name."""
+    """The rows of a block that hold each array: the first row and their number, by name."""
 
     def __init__(self, shapes: Mapping[str, tuple[int, ...]]):
         self.row_counts = {name: math.prod(shape) for name, shape in shapes.items()}
@@ -46,16 +46,15 @@ class BlockLayout:
         self.first_rows, self.n_rows = dict(zip(self.row_counts, ends, strict=False)), ends[-1]
 
 
-def compile_step_loop(
+def write_step_loop(
     programs: Mapping[str, NamedProgram],
     layout: BlockLayout,
     state_names: Sequence[str],
     is_per_trajectory: np.ndarray,
     lanes: int,
     saved_names: Sequence[str],
-    skip_optimisation: bool,
-) -> MachineCode:
-    """Compile the functions ``advance`` and ``begin`` of :class:`_StepLoopWriter` to machine code.
+) -> ir.Module:
+    """Write the functions ``advance`` and ``begin`` of :class:`_StepLoopWriter` for LLVM.
 
     Parameters
     ----------
@@ -69,8 +68,6 @@ def compile_step_loop(
         Parameters that lie in the block, under the name "p"; the others are common to all trajectories.
     saved_names : sequence of str
         Arrays that are written out at each save.
-    skip_optimisation : bool
-        See :class:`.machine_code.MachineCode`.
     """
     module = ir.Module("steps")
     function = ir.Function(module, ADVANCE_TYPE, "advance")
@@ -78,21 +75,23 @@ def compile_step_loop(
     _StepLoopWriter(function, programs, layout, state_names, is_per_trajectory, lanes, saved_names).write_loops()
     begin = ir.Function(module, BEGIN_TYPE, "begin")
     _StepLoopWriter(begin, programs, layout, state_names, is_per_trajectory, lanes, saved_names).write_start_function()
-    return MachineCode(module, skip_optimisation)
+    return module
 
 
 class CompiledLoops:
-    """Compiled functions of :func:`compile_step_loop`, optimised only once many steps are taken.
+    """Compiled functions of :func:`write_step_loop`, optimised only once many steps are taken.
 
     Parameters
     ----------
-    compile_loops : function from ``skip_optimisation`` to MachineCode
+    write_module : function that returns the module of :func:`write_step_loop`
+    key : str
+        See :class:`.machine_code.MachineCode`.
     can_skip_optimisation : bool
         Whether code may stay unoptimised: such code takes a place on the stack for each of its operations.
     """
 
-    def __init__(self, compile_loops: Callable[[bool], MachineCode], can_skip_optimisation: bool):
-        self._compile = compile_loops
+    def __init__(self, write_module: Callable[[], ir.Module], key: str, can_skip_optimisation: bool):
+        self._write_module, self._key = write_module, key
         self._can_skip_optimisation = can_skip_optimisation
         self._steps_so_far = 0
         self._lock = threading.Lock()
@@ -101,7 +100,7 @@ class CompiledLoops:
         ] = []  # kept loaded, because a thread may be running any of them
 
     def loop_functions(self, n_steps: int, planned_steps: int = 0) -> tuple[Any, Any]:
-        """Return ``begin`` and ``advance``, optimised if ``n_steps`` now and ``planned_steps`` later are worth it."""
+        """Return the functions ``begin`` and ``advance``, optimised if the numbers of steps are worth it."""
         if self._loaded and not self._loaded[-1][0].skip_optimisation:
             return self._loaded[-1][1:]
         with self._lock, report_compiler_faults():
@@ -110,12 +109,13 @@ class CompiledLoops:
                 self._can_skip_optimisation and self._steps_so_far + planned_steps <= MAX_UNOPTIMISED_STEPS
             )
             if not self._loaded:
-                self._append_loop_functions(self._compile(skip_optimisation))
+                self._append_loop_functions(MachineCode(self._write_module, skip_optimisation, self._key))
             elif not skip_optimisation and self._loaded[-1][0].skip_optimisation:
-                self._append_loop_functions(MachineCode(self._loaded[-1][0].ir_text))
+                self._append_loop_functions(self._loaded[-1][0].optimised())
             return self._loaded[-1][1:]
 
     def _append_loop_functions(self, machine_code: MachineCode) -> None:
+        """Append the functions of machine code to those in memory."""
         self._loaded.append(
             (
                 machine_code,
@@ -177,11 +177,13 @@ class _StepLoopWriter(ProgramWriter):
         self.block, self.block_index = self.builder.alloca(FLOAT64_POINTER), self.builder.alloca(INT64)
 
     def _allocate_slots(self, name: str) -> list[ir.Value]:
+        """Return new stack slots for the entries of an array."""
         return [self.builder.alloca(self.double_type, name=f"{name}_{i}") for i in range(self.layout.row_counts[name])]
 
     # -- the loops ----------------------------------------------------------------------------------------------------
 
     def write_loops(self) -> None:
+        """Write ``advance``: loops over blocks and steps with saves."""
         build, argument = self.builder, self.arguments
         for slot in itertools.chain.from_iterable(self.slots.values()):
             build.store(self.constant(0.0), slot)
@@ -223,13 +225,13 @@ class _StepLoopWriter(ProgramWriter):
         self.builder.ret_void()
 
     def select_block(self, block_number: ir.Value) -> None:
-        """Make block i the one that the following instructions work on."""
+        """Make a block the one that the following instructions work on."""
         offset = self.builder.mul(block_number, self.int64(self.layout.n_rows * self.lanes))
         self.builder.store(self.builder.gep(self.arguments["blocks"], [offset]), self.block)
         self.builder.store(block_number, self.block_index)
 
     def copy_noise_increments_to_slots(self, step_number: ir.Value) -> None:
-        """Load the increments of a step from row ``step_number`` of ``noise``."""
+        """Copy the noise increments of a step to the slots of ``dW``."""
         build, slots = self.builder, self.slots["dW"]
         row = build.mul(step_number, self.int64(len(slots) * self.lanes))
         for j, slot in enumerate(slots):
@@ -272,7 +274,7 @@ class _StepLoopWriter(ProgramWriter):
     # -- rows and slots -----------------------------------------------------------------------------------------------
 
     def write_program_and_store_results(self, name: str) -> None:
-        """Run a program; in the active lanes its results replace the old values."""
+        """Write a program and store its results in slots, in the active lanes only."""
         named_program, build, active_lanes = self.programs[name], self.builder, self.active_lanes
 
         def read(i: int, j: int) -> ir.Value:
@@ -300,6 +302,7 @@ class _StepLoopWriter(ProgramWriter):
                 )
 
     def load_parameter(self, i: int) -> ir.Value:
+        """Return parameter i, from the block if it differs between trajectories."""
         row, build = self.parameter_rows[i], self.builder
         if row is not None:
             return build.load(self.row_pointer(self.layout.first_rows["p"] + row), align=8)
@@ -308,21 +311,24 @@ class _StepLoopWriter(ProgramWriter):
         return self.splat(value)
 
     def row_pointer(self, row: int) -> ir.Value:
+        """Return the pointer to a row of the current block."""
         start = self.builder.gep(self.builder.load(self.block), [self.int64(row * self.lanes)])
         return self.builder.bitcast(start, self.double_type.as_pointer())
 
     def load_fields_from_block(self, names: Sequence[str]) -> None:
+        """Copy fields from the current block to slots."""
         for name in names:
             for i, slot in enumerate(self.slots[name]):
                 self.builder.store(self.builder.load(self.row_pointer(self.layout.first_rows[name] + i), align=8), slot)
 
     def store_fields_in_block(self, names: Sequence[str]) -> None:
+        """Copy fields from slots to the current block."""
         for name in names:
             for i, slot in enumerate(self.slots[name]):
                 self.builder.store(self.builder.load(slot), self.row_pointer(self.layout.first_rows[name] + i), align=8)
 
     def store_saved_fields(self, block_number: ir.Value, save_number: ir.Value) -> None:
-        """Write the saved fields of block i to ``out``, as save ``save_number``."""
+        """Write the saved fields of a block to ``out``, as save ``save_number``."""
         build, argument = self.builder, self.arguments
         saved_slots = [slot for name in self.saved_names for slot in self.slots[name]]
         row = build.add(build.mul(block_number, argument["saves"]), build.sub(save_number, self.int64(1)))
@@ -339,10 +345,8 @@ CONVERGED_INDEX = 0
 """Index among the arguments of Newton's method of the flag that the stage equations are solved."""
 
 
-def compile_newton_solver(
-    program: Program, layout: BlockLayout, is_per_trajectory: np.ndarray, lanes: int
-) -> MachineCode:
-    """Compile the function ``solve(p, block, lane)``, which runs ``program`` on the arrays of one lane.
+def write_newton_solver(program: Program, layout: BlockLayout, is_per_trajectory: np.ndarray, lanes: int) -> ir.Module:
+    """Write for LLVM the function ``solve(p, block, lane)``, which runs ``program`` on the arrays of one lane.
 
     Parameters
     ----------
@@ -383,4 +387,4 @@ def compile_newton_solver(
     ):
         build.store(value, row_pointer(first_row + i))
     build.ret_void()
-    return MachineCode(module)
+    return module

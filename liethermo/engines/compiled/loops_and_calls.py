@@ -20,7 +20,7 @@ TABLE_ALIGNMENT_BYTES = 8
 
 
 def write_block(writer: Any, block: Block, args: Sequence[Any]) -> BlockResults:
-    """Write the instructions of a block (a loop, call or matrix product) on ``args``, values and tables.
+    """Write the instructions of a block (a loop, call or matrix product) and return its results.
 
     Parameters
     ----------
@@ -41,14 +41,14 @@ def write_block(writer: Any, block: Block, args: Sequence[Any]) -> BlockResults:
 
 
 def clamp_index(writer: Any, index: ir.Value, length: int) -> ir.Value:
-    """Clamp an index to the range of a table of ``length`` entries."""
-    build, last = writer.builder, writer.constant(length - 1)
+    """Return an index clamped to the range of a table of ``length`` entries."""
+    build, last_index = writer.builder, writer.constant(length - 1)
     index = build.select(build.icmp_signed("<", index, writer.constant(0)), writer.constant(0), index)
-    return build.select(build.icmp_signed(">", index, last), last, index)
+    return build.select(build.icmp_signed(">", index, last_index), last_index, index)
 
 
 def select_entry(writer: Any, index: ir.Value, entries: Sequence[ir.Value]) -> ir.Value:
-    """Select the entry at ``index``, clamped to the range, by the bits of the index."""
+    """Return the entry at ``index``, clamped to the range, selected by the bits of the index."""
     build, index = writer.builder, clamp_index(writer, index, len(entries))
     entries, bit = list(entries), 0
     while len(entries) > 1:
@@ -59,7 +59,7 @@ def select_entry(writer: Any, index: ir.Value, entries: Sequence[ir.Value]) -> i
 
 
 def _store_in_new_slots(writer: Any, kinds: Sequence[str], values: Sequence[ir.Value]) -> list[ir.Value]:
-    """Allocate a stack slot for each value and store the value there."""
+    """Return pointers to new stack slots that hold the values."""
     build, slots = writer.builder, []
     for kind, value in zip(kinds, values, strict=True):
         with build.goto_entry_block():  # otherwise each pass of an outer loop would take more of the stack
@@ -70,11 +70,12 @@ def _store_in_new_slots(writer: Any, kinds: Sequence[str], values: Sequence[ir.V
 
 
 def _make_argument_reader(*arrays: Sequence[ir.Value]) -> Callable[[int, int], ir.Value]:
+    """Return a function that reads entry j of array i from lists of values."""
     return lambda i, j: arrays[i][j]
 
 
 def _write_while(writer: Any, loop: WhileLoop, args: Sequence[ir.Value]) -> BlockResults:
-    """Write a while loop, which runs until the test fails in every active lane.
+    """Write a while loop, which runs until its test fails in every active lane, and return its results.
 
     A pass does not wait for the test of which lanes have left the loop: these lanes run on, and their results are
     discarded. They do wait if an inner loop might not end for them.
@@ -107,6 +108,7 @@ def _write_while(writer: Any, loop: WhileLoop, args: Sequence[ir.Value]) -> Bloc
 
 
 def _write_scan(writer: Any, loop: ScanLoop, args: Sequence[Any]) -> BlockResults:
+    """Write a loop over the rows of tables with a carry, as ``jax.lax.scan``, and return its results."""
     build, n_constants = writer.builder, len(loop.body.inputs[0])
     start = n_constants + len(loop.carry_kinds)
     constants = args[:n_constants]
@@ -125,7 +127,7 @@ def _write_scan(writer: Any, loop: ScanLoop, args: Sequence[Any]) -> BlockResult
 
 
 class Table:
-    """Values of one type in memory, read and written by their indices.
+    """Values of one type in memory, which the program reads and writes by index.
 
     Parameters
     ----------
@@ -167,27 +169,29 @@ class Table:
             self.write(writer.int64(i), value)
 
     def view_at(self, writer: Any, start: ir.Value) -> Table:
-        """Return a view of this table in another function, with its own pointer ``start``."""
+        """Return this table as seen by another function, which gets its pointer as an argument."""
         return Table(writer, self.value_type, length=self.length, start=start, stride=self.stride)
 
     @property
     def signature(self) -> tuple:
-        """Type, length and stride: the part of the table that is compiled into a function that takes it."""
+        """Type, length and stride of the table, on which the code of a function that takes it depends."""
         return str(self.start.type), self.length, self.stride
 
     def _entry_pointer(self, i: ir.Value) -> ir.Value:
+        """Return the pointer to entry i."""
         if self.stride != 1:
             i = self.builder.mul(i, self.writer.int64(self.stride))
         return self.builder.gep(self.start, [i])
 
     def read(self, i: ir.Value) -> ir.Value:
+        """Return the entry at one index i, the same in all lanes."""
         value = self.builder.load(self._entry_pointer(i), align=TABLE_ALIGNMENT_BYTES)
         if isinstance(self.value_type, ir.DoubleType):
             return self.writer.splat(value)
         return self.builder.trunc(value, self.value_type) if self.memory_type else value
 
     def gather(self, indices: ir.Value) -> ir.Value:
-        """Return in each lane the entry at the index of that lane, clamped to the range."""
+        """Return the entry at an index of its own for each lane, clamped to the range."""
         build, lanes, indices = self.builder, self.writer.lanes, clamp_index(self.writer, indices, self.length)
         if lanes == 1:
             return self.read(indices)
@@ -205,34 +209,37 @@ class Table:
         return build.trunc(gathered, self.value_type) if self.memory_type else gathered
 
     def write(self, i: ir.Value, value: ir.Value) -> None:
+        """Store a value as entry i."""
         value = self.builder.zext(value, self.memory_type) if self.memory_type else value
         self.builder.store(value, self._entry_pointer(i), align=TABLE_ALIGNMENT_BYTES)
 
 
 class BlockResults:
-    """Results of a block: values, then the columns of tables of one length, which are read when they are used."""
+    """Results of a block: some values, followed by tables whose entries are read when they are used."""
 
     def __init__(self, values: Sequence[ir.Value], tables: Sequence[Table] = (), length: int = 1):
         self.values, self.tables, self.length = values, tables, length
 
     def item(self, i: int) -> ir.Value:
+        """Return result i as a value."""
         if i < len(self.values):
             return self.values[i]
         table, row = divmod(i - len(self.values), self.length)
         return self.tables[table].read(ir.Constant(ir.IntType(64), row))
 
     def table_at(self, first_result_index: int) -> Table:
+        """Return the table whose first entry is the given result."""
         return self.tables[(first_result_index - len(self.values)) // self.length]
 
 
 def make_table(writer: Any, values: Sequence[ir.Value]) -> Table:
-    """Return a table of values, converted to doubles if one of them is a double."""
+    """Return a new table of values, converted to doubles if one of them is a double."""
     value_type = writer.double_type if any(value.type == writer.double_type for value in values) else values[0].type
     return Table(writer, value_type, [writer.cast(v, "f") if value_type == writer.double_type else v for v in values])
 
 
 def _call_routine(writer: Any, routine: Routine, args: Sequence[Any]) -> BlockResults:
-    """Call a routine as a shared function: numbers are passed in memory, and tables by pointer."""
+    """Call a routine, compiled once as a function for all calls, and return its results."""
     build, n_results = writer.builder, len(routine.result_kinds)
     tables = {i: a for i, a in enumerate(args) if isinstance(a, Table)}
     numbers = [writer.cast(a, "f") for i, a in enumerate(args) if i not in tables]
@@ -246,6 +253,7 @@ def _call_routine(writer: Any, routine: Routine, args: Sequence[Any]) -> BlockRe
 
 
 def _write_routine_function(writer: Any, routine: Routine, name: str, tables: Mapping[int, Table]) -> ir.Function:
+    """Return the LLVM function of a routine, for tables of given signatures."""
     argument_types = [writer.double_type.as_pointer()] * 2 + [a.start.type for a in tables.values()]
     function, function_writer = writer.new_function(name, argument_types)
     build, (inputs, results, *starts) = function_writer.builder, function.args
@@ -270,7 +278,7 @@ PRODUCT_TILE_WIDTH = 8
 
 
 def _write_matrix_product(writer: Any, block: MatrixProduct, args: Sequence[Table]) -> BlockResults:
-    """Write a matrix product as a call of a function for these shapes, which adds the terms in order."""
+    """Call a function that multiplies two matrices, compiled once per shape, and return the product."""
     build, (m, _, n) = writer.builder, block.sizes
     product = Table(writer, writer.double_type, length=m * n)
     signature = repr((block.sizes, block.strides, *(a.signature for a in args)))
@@ -283,6 +291,7 @@ def _write_matrix_product(writer: Any, block: MatrixProduct, args: Sequence[Tabl
 def _write_matrix_product_function(
     writer: Any, block: MatrixProduct, tables: Sequence[Table], name: str
 ) -> ir.Function:
+    """Return the LLVM function of a matrix product, which adds its terms in order."""
     m, k, n = block.sizes
     function, function_writer = writer.new_function(
         name, [*(a.start.type for a in tables), writer.double_type.as_pointer()]
@@ -326,7 +335,7 @@ def _write_matrix_product_function(
 
 
 def _call_kernel(writer: Any, call: LapackCall, args: Sequence[ir.Value]) -> BlockResults:
-    """Call a LAPACK kernel lane by lane, so that the result in one lane does not depend on the others."""
+    """Call a LAPACK kernel for each lane by itself, and return its results."""
     build, n_results = writer.builder, len(call.result_kinds)
     inputs = Table(writer, writer.double_type, [writer.cast(a, "f") for a in args])
     results = Table(writer, writer.double_type, length=n_results)

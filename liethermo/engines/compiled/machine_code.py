@@ -24,40 +24,46 @@ from .llvm_writer import FLOAT64, INT64, ProgramWriter
 
 
 class MachineCode:
-    """Machine code of a module, unloaded with this object.
+    """Machine code of an LLVM module, which is unloaded when this object is deleted.
 
     Parameters
     ----------
-    module : ir.Module, or its text
+    module : ir.Module, or a function that returns one or its text
+        A function is called if the code is not in the cache.
     skip_optimisation : bool
         Do not optimise the code, which takes longer than a short run. Its results are the same.
+    key : str, optional
+        Text that identifies the module in all processes, and finds its code in the cache; by default the module's text.
 
     Attributes
     ----------
     skip_optimisation : bool
         Whether the code is not optimised; code from the cache may be, even if it was not asked for.
-    ir_text : str
     """
 
-    def __init__(self, module: ir.Module | str, skip_optimisation: bool = False):
-        text = self.ir_text = str(module)
-        if lapack.SYMBOL_PREFIX in text:
-            lapack.bind_scipy_functions_in_llvm()
+    def __init__(self, module: ir.Module | Callable, skip_optimisation: bool = False, key: str = ""):
+        self._module_text = functools.cache(lambda: str(module() if callable(module) else module))
+        self._key = key
         with _lock:
             for self.skip_optimisation in (False, True) if skip_optimisation else (False,):
-                name = hashlib.sha256(
-                    f"{_host_target_cpu_features_and_text()[-1]} {self.skip_optimisation}\n{text}".encode()
-                ).hexdigest()[:32]
-                object_file = _parse_object_file(read_machine_code(name))
-                if object_file is not None:
+                name = _cache_name(f"{self.skip_optimisation}\n{key or self._module_text()}")
+                code = read_machine_code(name)
+                object_file = _parse_object_file(code)
+                if code is not None and object_file is not None:
                     break
             else:
-                code = _compile_module(text, skip_optimisation)
+                code = _compile_module(self._module_text(), skip_optimisation)
                 write_machine_code(name, code)
                 object_file = _parse_object_file(code)
+            if lapack.SYMBOL_PREFIX.encode() in code:
+                lapack.bind_scipy_functions_in_llvm()
             self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _new_target_machine())
             self._engine.add_object_file(object_file)
             self._engine.finalize_object()
+
+    def optimised(self) -> MachineCode:
+        """Return optimised machine code of the same module."""
+        return MachineCode(self._module_text, key=self._key)
 
     def function_address(self, name: str) -> int:
         """Return the address of the function ``name``."""
@@ -67,9 +73,29 @@ class MachineCode:
 _lock = threading.Lock()
 
 
+def _cache_name(text: str) -> str:
+    """Return the name in the cache of machine code that is identified by a text, on this machine."""
+    return hashlib.sha256(f"{_host_target_cpu_features_and_text()[-1]} {text}".encode()).hexdigest()[:32]
+
+
+COUNT_SUFFIX = ".count"
+"""Suffix of the files with the number of operations of a program."""
+
+
+def read_operation_count(key: str) -> int | None:
+    """Return the number of operations that was written for a key; None if there is none."""
+    content = read_machine_code(_cache_name(key), COUNT_SUFFIX)
+    return int(content) if content is not None and content.isdigit() else None
+
+
+def write_operation_count(key: str, count: int) -> None:
+    """Write the number of operations of the program with a key to the cache."""
+    write_machine_code(_cache_name(key), str(count).encode(), COUNT_SUFFIX)
+
+
 @functools.cache
 def _host_target_cpu_features_and_text() -> tuple[llvm.Target, str, str, str]:
-    """Return the LLVM target, CPU and features of this machine, and a text that identifies them and the LLVM version.
+    """Return the LLVM target, CPU and features of this machine, and a text that identifies them.
 
     ``$LIETHERMO_CPU`` selects another CPU whose instructions this machine supports, by its LLVM name, such as
     ``x86-64-v3``, which has AVX2 and no AVX-512.
@@ -87,13 +113,13 @@ def _host_target_cpu_features_and_text() -> tuple[llvm.Target, str, str, str]:
 
 
 def _new_target_machine(skip_optimisation: bool = False) -> llvm.TargetMachine:
-    """Return an LLVM compiler for this machine; an engine created with it owns it."""
+    """Return a new LLVM compiler for this machine, optimising unless ``skip_optimisation``."""
     target, cpu, features, _ = _host_target_cpu_features_and_text()
     return target.create_target_machine(cpu, features, opt=0 if skip_optimisation else 3, jit=True, reloc="pic")
 
 
 def _parse_object_file(code: bytes | None) -> llvm.ObjectFileRef | None:
-    """Return the code as an object file for the linker; None if it is no valid object file, which would crash LLVM."""
+    """Return machine code as an object file for LLVM's linker; None if it is invalid, which would crash LLVM."""
     if code is None or not (code.startswith(OBJECT_FILE_MAGICS) or _is_valid_elf(code)):
         return None
     try:
@@ -107,7 +133,7 @@ OBJECT_FILE_MAGICS = (b"\xcf\xfa\xed\xfe", b"\x64\x86", b"\x64\xaa")
 
 
 def _is_valid_elf(code: bytes) -> bool:
-    """Return whether the bytes are a relocatable ELF object whose sections all lie within them."""
+    """Return whether code is a relocatable ELF object whose sections all lie within its bytes."""
     if len(code) < 64 or code[:5] != b"\x7fELF\x02" or struct.unpack_from("<H", code, 16) != (1,):
         return False
     (table_offset,) = struct.unpack_from("<Q", code, 40)
@@ -147,7 +173,7 @@ EVALUATE_SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_int
 
 
 class PointEvaluator:
-    """Compiled function of parameters and a point, evaluated at several points by one call.
+    """A compiled function of parameters and a point, which is evaluated at many points by one call.
 
     The results are written to the same array by every call, so each thread needs an evaluator of its own.
 
@@ -186,7 +212,7 @@ class PointEvaluator:
 
 
 class _SeparateRoundingWriter(ProgramWriter):
-    """A writer that rounds products before it adds them, as NumPy does, so that equal products cancel."""
+    """A writer of programs that rounds products before it adds them, as NumPy does."""
 
     def fused_multiply_add(self, op, product_index, factors, terms) -> ir.Value:
         product = self.write_operation("mul", factors)
@@ -194,7 +220,7 @@ class _SeparateRoundingWriter(ProgramWriter):
 
 
 def _compile_evaluator(program: Program) -> MachineCode:
-    """Compile ``evaluate(parameters, points, results, count)``, which runs a program at each of ``count`` points."""
+    """Return the machine code of ``evaluate(parameters, points, results, count)``, a program at each point."""
     module = ir.Module("points")
     pointer = FLOAT64.as_pointer()
     function = ir.Function(module, ir.FunctionType(ir.VoidType(), [pointer, pointer, pointer, INT64]), "evaluate")

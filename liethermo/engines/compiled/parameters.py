@@ -17,7 +17,7 @@ from ...tracing.caching import memoize
 
 @dataclass(frozen=True)
 class ProgramStructure:
-    """Structure that systems, methods or step controls share if they differ only in their parameters.
+    """A structure shared by systems, methods or step controls that differ only in values of their parameters.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class ProgramStructure:
 
     @property
     def n_parameters(self) -> int:
-        """Number of all entries of the parameter arrays."""
+        """Total number of entries of the parameter arrays."""
         return sum(map(math.prod, self.shapes))
 
     def build(self, p) -> Any:

@@ -15,12 +15,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import ClosedJaxpr
 
 from ...integrators import OneStepMethod
 from ...integrators.fluctuating import noise_dimension, with_noise_increments
-from ...systems.clock import system_of_step
+from ...systems.clock import system_between_breaks
 from ...tracing.caching import LRUCache
 from ...tracing.calls import deferred_p
+from ...tracing.fingerprint import compiler_fingerprint, program_fingerprint
+from ...tracing.program import Program
 from ...tracing.scalarize import report_compiler_faults, scalarize
 from ..adaptive_steps import ATTEMPT_FIELDS, attempt_step, initial_adaptive_state
 from ..root_bracket import packed_bracket_shape
@@ -35,10 +38,10 @@ from .loop_codegen import (
     BlockLayout,
     CompiledLoops,
     NamedProgram,
-    compile_newton_solver,
-    compile_step_loop,
+    write_newton_solver,
+    write_step_loop,
 )
-from .machine_code import MachineCode
+from .machine_code import MachineCode, read_operation_count, write_operation_count
 from .parameters import ProgramStructure
 
 STATE_FIELDS = State._fields
@@ -71,7 +74,7 @@ EMPTY_INCREMENTS = np.zeros(0)
 
 
 class CompiledStepLoop:
-    """Compiled step loop of one method on systems of one structure; parameters are arguments.
+    """A compiled loop of steps of one method, for all systems of one structure.
 
     With a ``control`` a step is an attempt of an adaptive run, whose size the loop chooses.
 
@@ -96,6 +99,8 @@ class CompiledStepLoop:
         Inputs of the initial state besides p and x; inputs of a step besides the fields.
     saved_fields : tuple of str
         Fields that are written out at each save.
+    n_operations : int
+        Number of scalar operations of a step with one iteration.
     """
 
     def __init__(
@@ -136,14 +141,9 @@ class CompiledStepLoop:
                 "event_values": control.event_shape,
                 "root_bracket": packed_bracket_shape(control.event_shape),
             }
-        step_program = self._trace_program(
-            self.fields_after_step, (*self.step_inputs, *self.field_names), self.field_names
-        )
-        if method.explicit:
-            variable_inputs = [i for i, a in enumerate(step_program.arguments) if a not in ("p", "h")]
-            step_program = step_program._replace(program=step_program.program.regroup_constant_factors(variable_inputs))
-        initial_program = self._trace_program(self.initial_fields, ("p", "x", *self.initial_inputs), self.field_names)
-        self._programs = {"step": step_program, "begin": initial_program}
+        self._step_jaxpr = self._trace(self.fields_after_step, (*self.step_inputs, *self.field_names))
+        self._initial_jaxpr = self._trace(self.initial_fields, ("p", "x", *self.initial_inputs))
+        self._is_explicit = method.explicit
         buffer_size = (
             0
             if method.explicit
@@ -160,15 +160,20 @@ class CompiledStepLoop:
             (first_rows[name], first_rows[name] + row_counts[name], self.field_shape(name)) for name in STATE_FIELDS
         ]
         state_names = [name for name in (*self.field_names, "h") if name in first_rows]
-        compile_loops = functools.partial(
-            compile_step_loop, self._programs, self._layout, state_names, is_per_trajectory, lanes, self.saved_fields
+        self._key = self._cache_key(self._step_jaxpr, self._initial_jaxpr)
+        self.n_operations = self._count_operations()
+        self._loops = CompiledLoops(
+            lambda: write_step_loop(
+                self._programs, self._layout, state_names, is_per_trajectory, lanes, self.saved_fields
+            ),
+            self._key,
+            lanes == 1 and self.n_operations <= MAX_UNOPTIMISED_OPERATIONS,
         )
-        self._loops = CompiledLoops(compile_loops, lanes == 1 and self.n_operations <= MAX_UNOPTIMISED_OPERATIONS)
 
     # -- what is compiled -----------------------------------------------------------------------------------------
 
     def build_modules(self, p) -> list[Any]:
-        """Return system and method, and the step control of an adaptive run, with the parameters p."""
+        """Return the system, the method and, for an adaptive run, the step control with parameters p, shape (p,)."""
         ends = itertools.accumulate(structure.n_parameters for structure in self._structures)
         return [
             structure.build(p[end - structure.n_parameters : end])
@@ -176,7 +181,7 @@ class CompiledStepLoop:
         ]
 
     def initial_fields(self, p, x, *times) -> tuple:
-        """Return the fields of a run that starts at x."""
+        """Return the fields of the state, or of the adaptive state, of a run that starts at x."""
         system, method, *control = self.build_modules(p)
         if not control:
             return initial_run_state(system, method, x)
@@ -184,41 +189,48 @@ class CompiledStepLoop:
         return *adaptive_state.state, *adaptive_state[1:]
 
     def fields_after_step(self, p, dW, *inputs) -> tuple:
-        """Return the fields after a step or an attempt; ``inputs`` are h (fixed steps only) and the old fields."""
+        """Return the fields of the state after a step; ``inputs`` are h (fixed steps only) and the old fields."""
         system, method, *control = self.build_modules(p)
         if not control:
             h, *fields = inputs
             return take_step(
-                system, with_noise_increments(method, dW), State(*fields), h, self._options, self._newton_fallback(dW)
+                system,
+                with_noise_increments(method, dW),
+                State(*fields),
+                h,
+                self._options,
+                self._make_newton_fallback(dW),
             )
         previous_state = AdaptiveState(State(*inputs[: len(STATE_FIELDS)]), *inputs[len(STATE_FIELDS) :])
         adaptive_state = attempt_step(
-            system, method, control[0], previous_state, self._options, self._newton_fallback(dW)
+            system, method, control[0], previous_state, self._options, self._make_newton_fallback(dW)
         )
         return *adaptive_state.state, *adaptive_state[1:]
 
-    def _newton_fallback(self, dW) -> Callable:
-        """Return the fallback for :func:`..step.take_step`: a program compiled at its first use."""
+    def _make_newton_fallback(self, noise_increments) -> Callable:
+        """Return the function that replaces Newton's method in a step: a program that is compiled at first use."""
 
         def bind_deferred_newton(fixed_point_result: StageSolution, *stage_inputs) -> StageSolution:
             initial_outputs = [1.0 * getattr(fixed_point_result, name) for name in NEWTON_OUTPUTS]
             outputs = deferred_p.bind(
-                *initial_outputs, dW, *(jnp.asarray(a) for a in stage_inputs), results=len(NEWTON_OUTPUTS)
+                *initial_outputs, noise_increments, *(jnp.asarray(a) for a in stage_inputs), results=len(NEWTON_OUTPUTS)
             )
             solution = fixed_point_result._replace(**dict(zip(NEWTON_OUTPUTS, outputs, strict=True)))
             return solution._replace(converged=solution.converged > 0.0, is_finite=solution.is_finite > 0.0)
 
         return bind_deferred_newton
 
-    def _solve_packed_newton(self, p, packed) -> tuple:
-        """Run Newton's method on the packed outputs and inputs; return the new outputs."""
+    def _solve_packed_newton(self, p, packed_buffer) -> tuple:
+        """Return the outputs of Newton's method, from its inputs packed in one array."""
         system, method, *_ = self.build_modules(p)
         shapes = [self.field_shape(name) for name in (*NEWTON_OUTPUTS, *NEWTON_INPUTS)]
         ends = itertools.accumulate(map(math.prod, shapes))
-        arrays = [packed[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, shapes, strict=True)]
+        arrays = [
+            packed_buffer[end - math.prod(shape) : end].reshape(shape) for end, shape in zip(ends, shapes, strict=True)
+        ]
         inputs = NewtonInputs(*arrays[len(NEWTON_OUTPUTS) :])
         equations = stage_equations(
-            system_of_step(system, inputs.x),
+            system_between_breaks(system, inputs.x),
             with_noise_increments(method, inputs.dW),
             inputs.x,
             inputs.compensation,
@@ -231,20 +243,53 @@ class CompiledStepLoop:
         solution = solve_newton(equations, self._options)
         return tuple(1.0 * getattr(solution, name) for name in NEWTON_OUTPUTS)
 
-    @property
-    def n_operations(self) -> int:
-        """Number of scalar operations of a step with one iteration."""
-        return self._programs["step"].program.instruction_count
+    # Unrolling a program and writing it for LLVM take most of the time before a first step, and are only done if the
+    # machine code is not in the cache: it is found by the traced program.
 
-    def _trace_program(self, function: Callable, names: Sequence[str], results: Sequence[str] = ()) -> NamedProgram:
-        shapes = [jax.ShapeDtypeStruct(self.field_shape(a), jnp.float64) for a in names]
-        constants = [self._constant_parameters if a == "p" else None for a in names]
-        return NamedProgram(scalarize(jax.make_jaxpr(function)(*shapes), constants), tuple(names), tuple(results))
+    def _trace(self, function: Callable, names: Sequence[str]) -> ClosedJaxpr:
+        shapes = [jax.ShapeDtypeStruct(self.field_shape(name), jnp.float64) for name in names]
+        return jax.make_jaxpr(function)(*shapes)
+
+    def _scalarize(self, jaxpr: ClosedJaxpr) -> Program:
+        """Unroll a traced program, with the constant entries of its first argument, p, compiled in."""
+        return scalarize(jaxpr, [self._constant_parameters, *[None] * (len(jaxpr.jaxpr.invars) - 1)])
+
+    @functools.cached_property
+    def _programs(self) -> dict[str, NamedProgram]:
+        """Scalar programs of a step and of the initial state."""
+        step_names, initial_names = (*self.step_inputs, *self.field_names), ("p", "x", *self.initial_inputs)
+        step_program = self._scalarize(self._step_jaxpr)
+        if self._is_explicit:
+            variable_inputs = [i for i, name in enumerate(step_names) if name not in ("p", "h")]
+            step_program = step_program.regroup_constant_factors(variable_inputs)
+        initial_program = self._scalarize(self._initial_jaxpr)
+        return {
+            "step": NamedProgram(step_program, step_names, self.field_names),
+            "begin": NamedProgram(initial_program, initial_names, self.field_names),
+        }
+
+    def _count_operations(self) -> int:
+        """Return the number of operations of a step, from the cache if possible."""
+        count = read_operation_count(self._key) if self._key else None
+        if count is None:
+            count = self._programs["step"].program.instruction_count
+            if self._key:
+                write_operation_count(self._key, count)
+        return count
+
+    def _cache_key(self, *jaxprs: ClosedJaxpr) -> str:
+        """Return a text that identifies the machine code of these programs in all processes, or "" if none can."""
+        fingerprints = [compiler_fingerprint(), *map(program_fingerprint, jaxprs)]
+        if None in fingerprints:
+            return ""
+        layout = self._layout.row_counts, self.field_names, self.saved_fields, self.lanes, self._is_explicit
+        masks = self._constant_parameters.tobytes(), self._is_per_trajectory.tobytes()
+        return f"{fingerprints} {layout} {masks}"
 
     # -- trajectories in blocks -----------------------------------------------------------------------------------
 
     def start_blocks(self, parameters, x: np.ndarray, planned_steps: int = 0, **fields: np.ndarray) -> np.ndarray:
-        """Return blocks, shape (blocks, rows * lanes), of trajectories that start at x, shape (trajectories, n).
+        """Return blocks, shape (blocks, rows * lanes), of trajectories at the start x, shape (trajectories, n).
 
         ``parameters`` has shape (p,), or (trajectories, p) if some differ; ``planned_steps`` decides on optimisation.
         """
@@ -259,7 +304,7 @@ class CompiledStepLoop:
         return blocks
 
     def block_rows(self, blocks: np.ndarray, name: str | None = None) -> np.ndarray:
-        """Return a field of blocks, or all their rows, as a view of shape (blocks, rows, lanes)."""
+        """Return the rows of a field in blocks, as a view of shape (blocks, rows, lanes); all rows for no name."""
         rows = blocks.reshape(len(blocks), self.n_rows, self.lanes)
         return rows if name is None else rows[:, self.row_slice(name)]
 
@@ -269,7 +314,7 @@ class CompiledStepLoop:
         return self._layout.n_rows
 
     def row_slice(self, name: str) -> slice:
-        """Return the rows of a field."""
+        """Return the slice of the rows of a block that hold a field."""
         start = self._layout.first_rows[name]
         return slice(start, start + self._layout.row_counts[name])
 
@@ -278,7 +323,7 @@ class CompiledStepLoop:
         return self._shapes.get(name, ())
 
     def blocks_from_fields(self, fields: dict[str, Any], parameters=None) -> np.ndarray:
-        """Return blocks of trajectories with these fields and status 0; other fields are undefined."""
+        """Return blocks of trajectories with given fields and status 0; the other fields are undefined."""
         if self._is_per_trajectory.any() and "p" not in fields:
             fields = fields | {"p": parameters[:, self._is_per_trajectory]}
         n_trajectories = len(fields["x"])
@@ -289,7 +334,7 @@ class CompiledStepLoop:
         return self._mark_empty_lanes(blocks, n_trajectories)
 
     def block_from_state(self, state: State) -> np.ndarray:
-        """Return the block of a single trajectory."""
+        """Return the block of a single trajectory with a given state."""
         block = np.zeros((1, self.n_rows))
         row = block[0]
         for (start, end, shape), value in zip(self._state_rows, state, strict=True):
@@ -311,20 +356,20 @@ class CompiledStepLoop:
         return self._mark_empty_lanes(np.ascontiguousarray(self._rows_to_lanes(rows)), len(rows))
 
     def _rows_to_lanes(self, rows: np.ndarray) -> np.ndarray:
-        """Rearrange rows, shape (trajectories, m), to (blocks, m, lanes); the last trajectory fills the empty lanes."""
+        """Return rows, shape (trajectories, m), as blocks, shape (blocks, m, lanes), padded by the last trajectory."""
         n_blocks = -(-len(rows) // self.lanes)
         if n_empty := n_blocks * self.lanes - len(rows):
             rows = np.concatenate([rows, np.repeat(rows[-1:], n_empty, axis=0)])
         return rows.reshape(n_blocks, self.lanes, -1).swapaxes(1, 2)
 
     def _mark_empty_lanes(self, blocks: np.ndarray, n_trajectories: int) -> np.ndarray:
-        """Mark the empty lanes of blocks, shape (blocks, rows, lanes), and return the blocks with one row each."""
+        """Set the status of the empty lanes of blocks, and return the blocks as (blocks, rows * lanes)."""
         n_used = n_trajectories - (len(blocks) - 1) * self.lanes
         blocks[-1, self._layout.first_rows["status"], n_used:] = StatusCode.EMPTY_LANE
         return blocks.reshape(len(blocks), -1)
 
     def read_fields(self, blocks: np.ndarray, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-        """Return fields of all lanes by name, trajectories first, including empty lanes."""
+        """Return fields of all lanes by name, lanes first, empty lanes included."""
         fields, n_lanes = {}, len(blocks) * self.lanes
         for name in self.field_names if names is None else names:
             values = self.block_rows(blocks, name).swapaxes(0, 1)
@@ -341,7 +386,7 @@ class CompiledStepLoop:
         noise=None,
         out=None,
     ) -> np.ndarray:
-        """Advance blocks in place by up to ``n_saves * steps_per_save`` steps of size h; return the saved fields.
+        """Take up to ``n_saves * steps_per_save`` steps of size h in blocks, in place; return the saved fields.
 
         h is one step size, or one for each lane, empty lanes included. ``noise`` holds the increments of a stochastic
         method, shape (trajectories, steps, increments).
@@ -389,20 +434,20 @@ class CompiledStepLoop:
         return sum(self._layout.row_counts[name] for name in self.saved_fields)
 
     def noise_increments_by_lane_block(self, noise: np.ndarray | None, n_blocks: int, n_steps: int) -> np.ndarray:
-        """Rearrange noise increments to the order of the loop, shape (blocks, steps, increments, lanes)."""
+        """Return noise increments in the order of the loop, shape (blocks, steps, increments, lanes)."""
         n_increments = self._shapes["dW"][0]
         if not n_increments:
             return EMPTY_INCREMENTS
         if noise is None:
             return np.zeros((n_blocks, n_steps, n_increments, self.lanes))
-        padded = np.zeros((n_blocks * self.lanes, n_steps, n_increments))
-        padded[: len(noise)] = noise
-        return np.ascontiguousarray(padded.reshape(n_blocks, self.lanes, n_steps, -1).transpose(0, 2, 3, 1))
+        padded_noise = np.zeros((n_blocks * self.lanes, n_steps, n_increments))
+        padded_noise[: len(noise)] = noise
+        return np.ascontiguousarray(padded_noise.reshape(n_blocks, self.lanes, n_steps, -1).transpose(0, 2, 3, 1))
 
     # -- machine code -------------------------------------------------------------------------------------------------
 
     def loop_functions(self, n_steps: int, planned_steps: int = 0) -> tuple[Any, Any]:
-        """Return the functions ``begin`` and ``advance`` of the loop, optimised if many steps are taken in all."""
+        """Return the functions ``begin`` and ``advance`` of the loop, optimised if many steps are taken."""
         return self._loops.loop_functions(n_steps, planned_steps)
 
     def newton_address(self, is_needed: bool) -> int:
@@ -410,12 +455,17 @@ class CompiledStepLoop:
         return self._compiled_newton_address() if is_needed or self._newton_code is not None else 0
 
     def _compiled_newton_address(self) -> int:
-        """Return the address of Newton's method, which is compiled at the first call."""
+        """Return the address of Newton's method, compiled at the first call."""
         with self._lock, report_compiler_faults():
             if self._newton_code is None:
                 self._shapes[NEWTON_BUFFER] = (self._layout.row_counts[NEWTON_BUFFER],)
-                program = self._trace_program(self._solve_packed_newton, ("p", NEWTON_BUFFER)).program
-                self._newton_code = compile_newton_solver(program, self._layout, self._is_per_trajectory, self.lanes)
+                jaxpr = self._trace(self._solve_packed_newton, ("p", NEWTON_BUFFER))
+                self._newton_code = MachineCode(
+                    lambda: write_newton_solver(
+                        self._scalarize(jaxpr), self._layout, self._is_per_trajectory, self.lanes
+                    ),
+                    key=self._cache_key(jaxpr),
+                )
             return self._newton_code.function_address("solve")
 
 

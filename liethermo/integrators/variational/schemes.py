@@ -16,7 +16,7 @@ import manifolds as mf
 from ...errors import InputError
 from ...functions.conditions import checked_numbers
 from ...systems import ComposedSystem, EmbeddedSystem, SimpleClosedSystem, System
-from ...systems.kind_checks import require_kind, user_system
+from ...systems.kind_checks import require_kind, unwrap_user_system
 from ...tracing.programs import jit_cached
 from ..base import (
     WHY_FIXED_VARIATIONAL_STEP,
@@ -156,8 +156,8 @@ class VariationalIntegrator(OneStepMethod):
 
     def check(self, system: System) -> None:
         """Raise InputError unless the system is simple closed or composed, and the maps suit it."""
-        closed = _simple_closed_or_none(user_system(system))
-        if closed is not None and system.surface is not None:
+        closed = _simple_closed_or_none(unwrap_user_system(system))
+        if closed is not None and system.constraint_surface is not None:
             if any(type(map) is not FiniteDifference for map in (*self.phi, *self.forces, *self.constraint)):
                 raise InputError(
                     "on a manifold the maps must be lt.FiniteDifference itself, no subclass: they are evaluated on a "
@@ -206,7 +206,7 @@ class VariationalIntegrator(OneStepMethod):
     # -- the step ---------------------------------------------------------------------------------------------------
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
-        system = require_kind(user_system(system), SimpleClosedSystem, "VariationalIntegrator")
+        system = require_kind(unwrap_user_system(system), SimpleClosedSystem, "VariationalIntegrator")
         n = system.degrees_of_freedom
         q0, v0, S0, t = system.split_state(x + compensation)
         discrete, p0 = self.discrete_system(system, h, t), system.momentum(q0, v0, S0)

@@ -53,10 +53,10 @@ def laws(solution: Solution, path: str | os.PathLike | None = None) -> Figure:
     figure, axes = plt.subplots(
         panels, sharex=True, squeeze=False, figsize=(6.4, 1.1 + 1.7 * panels), dpi=DPI, layout="constrained"
     )
-    _draw_energy(axes[0, 0], solution.t, solution.energy_balance, " - W" if solution.laws.balance else "")
+    _draw_energy_error(axes[0, 0], solution.t, solution.energy_balance, " - W" if solution.laws.balance else "")
     if solution.entropy is not None:
         _draw_entropy(axes[1, 0], solution.t, solution.entropy)
-        _draw_production(axes[2, 0], solution.t, solution.entropy, _allowed_entropy_fall(audit))
+        _draw_entropy_production(axes[2, 0], solution.t, solution.entropy, _allowed_entropy_fall(audit))
     for ax in axes[:, 0]:
         ax.spines[["top", "right"]].set_visible(False)
         ax.margins(x=0.0)
@@ -66,7 +66,8 @@ def laws(solution: Solution, path: str | os.PathLike | None = None) -> Figure:
     return save_figure(figure, path)
 
 
-def _draw_energy(ax: Axes, t: np.ndarray, H: np.ndarray, work_label: str) -> None:
+def _draw_energy_error(ax: Axes, t: np.ndarray, H: np.ndarray, work_label: str) -> None:
+    """Draw the energy error relative to the initial energy over time; ``work_label`` is " - W" or ""."""
     initial_energy = float(H[0])
     error = (H - initial_energy) / (abs(initial_energy) or 1.0)
     max_error = float(np.abs(error).max())
@@ -80,6 +81,7 @@ def _draw_energy(ax: Axes, t: np.ndarray, H: np.ndarray, work_label: str) -> Non
 
 
 def _draw_entropy(ax: Axes, t: np.ndarray, S: np.ndarray) -> None:
+    """Draw the entropy over time, with a dashed line at its final value if it has converged."""
     ax.plot(t, S, color=BLUE, linewidth=1.5)
     ax.set_ylabel("entropy $S$")
     change = float(np.ptp(S))
@@ -99,15 +101,15 @@ def _allowed_entropy_fall(audit: Audit) -> float:
     return next((-row.tolerance for row in audit.rows if row.law == "least entropy increment" and row.tolerance), 0.0)
 
 
-def _draw_production(ax: Axes, t: np.ndarray, S: np.ndarray, rounding: float) -> None:
+def _draw_entropy_production(ax: Axes, t: np.ndarray, S: np.ndarray, rounding_threshold: float) -> None:
     dt, dS, t = np.diff(t), np.diff(S), (t[:-1] + t[1:]) / 2
-    rounding = rounding or 4 * EPS * float(np.abs(S).max())
-    is_rising, is_falling = dS > rounding, dS < -rounding
+    rounding_threshold = rounding_threshold or 4 * EPS * float(np.abs(S).max())
+    is_rising, is_falling = dS > rounding_threshold, dS < -rounding_threshold
     is_constant = ~(is_rising | is_falling)
     ax.set_yscale("log")
     ax.plot(t, np.where(is_rising, dS / dt, np.nan), color=GREEN, linewidth=1.5, marker="." if len(t) < 50 else "")
     if is_constant.any():
-        level = rounding / float(dt.max())
+        level = rounding_threshold / float(dt.max())
         ax.plot(
             t[is_constant],
             np.full(is_constant.sum(), level),
@@ -128,6 +130,7 @@ def _draw_production(ax: Axes, t: np.ndarray, S: np.ndarray, rounding: float) ->
 
 
 def _verdict_title(audit: Audit) -> str:
+    """Return the title of a figure: the verdict of the audit, with the measured values of the relevant laws."""
     violated_rows = [row for row in audit.rows if row.passed is False]
     if violated_rows:
         is_law_failure = audit.verdict == LAW_FAILURE_VERDICT
@@ -190,16 +193,16 @@ def projection(
     """
     path = checked_figure_path(path)
     if len(coordinates) not in (2, 3):
-        raise InputError(f"coordinates must be 2 or 3, got {len(coordinates)}")
+        raise InputError(f"coordinates must have 2 or 3 entries, got {len(coordinates)}")
     algebra = None if system is None else system.lie_algebra
     names = None if algebra is None else algebra.basis_names
-    labels, functions = zip(*(_label_and_function(c, solution, names) for c in coordinates), strict=True)
+    labels, functions = zip(*(_coordinate_label_and_function(c, solution, names) for c in coordinates), strict=True)
     figure = plt.figure(figsize=(6.4, 5.2), dpi=DPI, layout="constrained")
     ax: Any = figure.add_subplot(projection="3d" if len(coordinates) == 3 else None)
     if orbit_points:
         if algebra is None:
             raise InputError("orbit_points needs system=, a system on a Lie algebra")
-        orbit = _points_of_orbit(algebra, solution.x[0, : algebra.dim], orbit_points)
+        orbit = _random_points_of_coadjoint_orbit(algebra, solution.x[0, : algebra.dim], orbit_points)
         padding = np.broadcast_to(solution.x[0, algebra.dim :], (orbit_points, solution.x.shape[1] - algebra.dim))
         states = np.concatenate([orbit, padding], axis=1)
         ax.scatter(*(f(states) for f in functions), s=2.0, color="0.75", label="coadjoint orbit")
@@ -254,8 +257,8 @@ def invariants(solution: Solution, system: System, path: str | os.PathLike | Non
     return save_figure(figure, path)
 
 
-def _label_and_function(
-    coordinate: Coordinate, solution: Solution, names: tuple[str, ...] | None
+def _coordinate_label_and_function(
+    coordinate: Coordinate, solution: Solution, basis_names: tuple[str, ...] | None
 ) -> tuple[str, Callable[[np.ndarray], np.ndarray]]:
     """Return the label of a coordinate, and the coordinate as a function of states, shape (..., n)."""
     if callable(coordinate):
@@ -263,24 +266,26 @@ def _label_and_function(
         label = "function of the state" if text.startswith("<") else text
         return label, lambda x: np.asarray(jax.vmap(coordinate)(jnp.asarray(x)))
     if isinstance(coordinate, str):
-        if names is None or coordinate not in names:
-            raise InputError(
-                f"{coordinate!r} is not the name of a basis element: they are "
-                f"{', '.join(names) if names else 'not known'}"
+        if basis_names is None or coordinate not in basis_names:
+            cure = (
+                f"The names are {', '.join(basis_names)}"
+                if basis_names
+                else "Names need system=, a system on a Lie algebra whose basis has names"
             )
-        coordinate = names.index(coordinate)
+            raise InputError(f"{coordinate!r} is not the name of a basis element. {cure}")
+        coordinate = basis_names.index(coordinate)
     n = solution.x.shape[1]
     if isinstance(coordinate, bool) or not isinstance(coordinate, int | np.integer) or not 0 <= coordinate < n:
         raise InputError(f"a coordinate must be an index from 0 to {n - 1}, a name or a function, got {coordinate!r}")
     index = int(coordinate)
-    label = names[index] if names is not None and index < len(names) else rf"$\mu_{{{index + 1}}}$"
+    label = basis_names[index] if basis_names is not None and index < len(basis_names) else rf"$\mu_{{{index + 1}}}$"
     return label, lambda x: x[:, index]
 
 
-def _points_of_orbit(algebra, mu: np.ndarray, count: int) -> np.ndarray:
-    """Return random points of the coadjoint orbit through mu, shape (count, dim)."""
-    directions = jax.random.normal(jax.random.key(0), (ORBIT_FLOWS, count, algebra.dim))
-    points = jnp.broadcast_to(jnp.asarray(mu), (count, algebra.dim))
+def _random_points_of_coadjoint_orbit(algebra, mu: np.ndarray, n_points: int) -> np.ndarray:
+    """Return random points of the coadjoint orbit through mu, shape (n_points, dim)."""
+    directions = jax.random.normal(jax.random.key(0), (ORBIT_FLOWS, n_points, algebra.dim))
+    points = jnp.broadcast_to(jnp.asarray(mu), (n_points, algebra.dim))
     for x in directions:
         ad_transpose = jnp.swapaxes(algebra.ad(x), -1, -2)
         points = (jax.scipy.linalg.expm(ad_transpose) @ points[..., None])[..., 0]

@@ -67,7 +67,7 @@ def study(
     if "status" not in dataset:
         raise InputError("dataset must be the results of a study, but it has no variable status")
     axes = [str(dim) for dim in dataset["status"].dims]
-    values = dataset[_measure_name(dataset, axes, variable)]
+    values = dataset[_checked_or_first_measure_name(dataset, axes, variable)]
     extra_dims = [str(dim) for dim in values.dims if dim not in axes]
     point_coordinates = {name: c for name, c in dataset.coords.items() if c.dims == tuple(axes) and name not in axes}
     columns = [str(name) for name, c in point_coordinates.items() if c.dtype.kind in "fiu"]
@@ -79,17 +79,17 @@ def study(
         )
     if ax is None:
         _, ax = plt.subplots(figsize=(6.4, 4.4), dpi=DPI, layout="constrained")
-    is_failed = _has_failed(dataset)
+    is_failed = _failed_point_mask(dataset)
     if is_sample:
-        _draw_points(ax, values, is_failed, *(dataset[name] for name in columns[:2]))
+        _draw_scatter_plot(ax, values, is_failed, *(dataset[name] for name in columns[:2]))
     elif len(axes) == 1:
         _draw_lines(ax, values.transpose(axes[0], *extra_dims), is_failed, dataset[axes[0]])
     else:
-        _draw_map(ax, values.transpose(*axes), is_failed.transpose(*axes), contours)
+        _draw_heat_map(ax, values.transpose(*axes), is_failed.transpose(*axes), contours)
     return save_figure(ax.figure, path)  # type: ignore[arg-type]
 
 
-def _measure_name(dataset: xarray.Dataset, axes: list[str], variable: str | None) -> str:
+def _checked_or_first_measure_name(dataset: xarray.Dataset, axes: list[str], variable: str | None) -> str:
     measures = [str(name) for name in dataset.data_vars if name not in NON_MEASURE_VARIABLES]
     if variable is not None:
         if variable not in measures:
@@ -101,18 +101,18 @@ def _measure_name(dataset: xarray.Dataset, axes: list[str], variable: str | None
     return (scalar_measures or measures)[0]
 
 
-def _has_failed(dataset: xarray.Dataset) -> xarray.DataArray:
-    """Return for each point whether its status is none of "completed", "event" and "missing"."""
+def _failed_point_mask(dataset: xarray.Dataset) -> xarray.DataArray:
+    """Return a mask of the points whose status is not "completed", "event" or "missing"."""
     codes = dict(zip(dataset["status"].flag_meanings.split(), dataset["status"].flag_values, strict=True))
     return ~dataset["status"].isin([codes[name] for name in ("completed", "event", "missing") if name in codes])
 
 
-def _label(values: xarray.DataArray) -> str:
+def _label_with_unit(values: xarray.DataArray) -> str:
     name, units = values.attrs.get("long_name", str(values.name)), values.attrs.get("units")
     return f"{name} [{units}]" if units else name
 
 
-def _is_geometric(points: np.ndarray) -> bool:
+def _has_geometric_spacing(points: np.ndarray) -> bool:
     if len(points) < 3 or not (points > 0.0).all() or points.max() < 4.0 * points.min():
         return False
     gap_variations = [np.ptp(np.diff(p)) / np.abs(np.diff(p)).max() for p in (points, np.log(points))]
@@ -123,24 +123,24 @@ def _cell_edges(centres: np.ndarray) -> np.ndarray:
     """Return the edges of cells around their centres: midpoints on a linear or, if geometric, logarithmic axis."""
     if len(centres) == 1:
         return centres[0] + np.array([-0.5, 0.5]) * (abs(centres[0]) or 1.0)
-    p = np.log(centres) if _is_geometric(centres) else centres
+    p = np.log(centres) if _has_geometric_spacing(centres) else centres
     midpoints = (p[1:] + p[:-1]) / 2
     edges = np.concatenate([[2 * p[0] - midpoints[0]], midpoints, [2 * p[-1] - midpoints[-1]]])
-    return np.exp(edges) if _is_geometric(centres) else edges
+    return np.exp(edges) if _has_geometric_spacing(centres) else edges
 
 
-def _axis_values(coordinate: xarray.DataArray) -> np.ndarray:
-    """Return the numbers along an axis; texts are numbered from 0."""
+def _numeric_axis_values(coordinate: xarray.DataArray) -> np.ndarray:
+    """Return the values along an axis as numbers; texts are replaced by 0, 1, 2, …"""
     return coordinate.to_numpy().astype(float) if coordinate.dtype.kind in "fiub" else np.arange(coordinate.size) * 1.0
 
 
-def _set_axis(ax: Axes, letter: str, coordinate: xarray.DataArray, points: np.ndarray) -> None:
-    axis = getattr(ax, f"{letter}axis")
-    if _is_geometric(np.sort(points)):
-        getattr(ax, f"set_{letter}scale")("log")
+def _set_axis_scale_and_label(ax: Axes, axis_letter: str, coordinate: xarray.DataArray, points: np.ndarray) -> None:
+    axis = getattr(ax, f"{axis_letter}axis")
+    if _has_geometric_spacing(np.sort(points)):
+        getattr(ax, f"set_{axis_letter}scale")("log")
     if coordinate.dtype.kind not in "fiub":
         axis.set_ticks(points, [str(text) for text in coordinate.to_numpy()])
-    axis.set_label_text(_label(coordinate))
+    axis.set_label_text(_label_with_unit(coordinate))
 
 
 def _colour_options(values: np.ndarray) -> dict[str, Any]:
@@ -152,35 +152,37 @@ def _colour_options(values: np.ndarray) -> dict[str, Any]:
     return {"cmap": "viridis"}
 
 
-def _draw_map(ax: Axes, values: xarray.DataArray, failed: xarray.DataArray, contours: int) -> None:
+def _draw_heat_map(ax: Axes, values: xarray.DataArray, failure_mask: xarray.DataArray, n_contours: int) -> None:
     y_coordinate, x_coordinate = (values[dim] for dim in values.dims)
-    y, x = _axis_values(y_coordinate), _axis_values(x_coordinate)
+    y, x = _numeric_axis_values(y_coordinate), _numeric_axis_values(x_coordinate)
     rows, columns = np.argsort(y), np.argsort(x)
     y, x, z = y[rows], x[columns], values.to_numpy()[np.ix_(rows, columns)]
-    is_failed = failed.to_numpy()[np.ix_(rows, columns)]
+    is_failed = failure_mask.to_numpy()[np.ix_(rows, columns)]
     colours, masked_values = _colour_options(z), np.ma.masked_invalid(np.where(is_failed, np.nan, z))
     mesh = ax.pcolormesh(_cell_edges(x), _cell_edges(y), masked_values, rasterized=True, **colours)
-    bar = ax.figure.colorbar(mesh, ax=ax, label=_label(values))
+    bar = ax.figure.colorbar(mesh, ax=ax, label=_label_with_unit(values))
     if "norm" in colours:
         bar.set_ticks(np.unique(z[np.isfinite(z)]).tolist())
-    elif contours and min(z.shape) > 2 and masked_values.count() > 3 and np.ptp(masked_values.compressed()) > 0.0:
-        lines = ax.contour(x, y, masked_values, contours, colors="white", linewidths=0.6, alpha=0.8)
+    elif n_contours and min(z.shape) > 2 and masked_values.count() > 3 and np.ptp(masked_values.compressed()) > 0.0:
+        lines = ax.contour(x, y, masked_values, n_contours, colors="white", linewidths=0.6, alpha=0.8)
         ax.clabel(lines, fontsize="xx-small", fmt="%.3g")
     _hatch_cells(ax, _cell_edges(x), _cell_edges(y), is_failed)
     for letter, coordinate, points in (
-        ("x", x_coordinate, _axis_values(x_coordinate)),
-        ("y", y_coordinate, _axis_values(y_coordinate)),
+        ("x", x_coordinate, _numeric_axis_values(x_coordinate)),
+        ("y", y_coordinate, _numeric_axis_values(y_coordinate)),
     ):
-        _set_axis(ax, letter, coordinate, points)
+        _set_axis_scale_and_label(ax, letter, coordinate, points)
 
 
-def _hatch_cells(ax: Axes, x: np.ndarray, y: np.ndarray, is_failed: np.ndarray) -> None:
+def _hatch_cells(ax: Axes, x_edges: np.ndarray, y_edges: np.ndarray, is_failed: np.ndarray) -> None:
     """Hatch the cells of failed points; neighbours in a row are joined."""
     patches = []
     for i, row in enumerate(is_failed):
         turns = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(int), [0]])))
         for start, end in zip(turns[::2], turns[1::2], strict=True):
-            patches.append(Rectangle((x[start], y[i]), x[end] - x[start], y[i + 1] - y[i]))
+            patches.append(
+                Rectangle((x_edges[start], y_edges[i]), x_edges[end] - x_edges[start], y_edges[i + 1] - y_edges[i])
+            )
     if patches:
         ax.add_collection(PatchCollection(patches, **HATCH_STYLE), autolim=False)
         _add_failure_legend(ax)
@@ -192,10 +194,12 @@ def _add_failure_legend(ax: Axes) -> None:
     ax.legend(handles, labels, loc="upper left", fontsize="small", framealpha=0.9)
 
 
-def _draw_lines(ax: Axes, values: xarray.DataArray, failed: xarray.DataArray, coordinate: xarray.DataArray) -> None:
-    points = _axis_values(coordinate)
+def _draw_lines(
+    ax: Axes, values: xarray.DataArray, failure_mask: xarray.DataArray, coordinate: xarray.DataArray
+) -> None:
+    points = _numeric_axis_values(coordinate)
     order = np.argsort(points)
-    z, is_failed = values.to_numpy().reshape(len(points), -1)[order], failed.to_numpy()[order]
+    z, is_failed = values.to_numpy().reshape(len(points), -1)[order], failure_mask.to_numpy()[order]
     names = values[values.dims[1]].to_numpy() if values.ndim == 2 else [""]
     colours = (BLUE, ORANGE, GREEN, RED)
     for k, name in enumerate(names):
@@ -206,8 +210,8 @@ def _draw_lines(ax: Axes, values: xarray.DataArray, failed: xarray.DataArray, co
     edges = _cell_edges(points[order])
     for i in np.flatnonzero(is_failed):
         ax.axvspan(edges[i], edges[i + 1], zorder=0, **HATCH_STYLE)
-    _set_axis(ax, "x", coordinate, points)
-    ax.set_ylabel(_label(values))
+    _set_axis_scale_and_label(ax, "x", coordinate, points)
+    ax.set_ylabel(_label_with_unit(values))
     ax.spines[["top", "right"]].set_visible(False)
     if is_failed.any():
         _add_failure_legend(ax)
@@ -215,14 +219,14 @@ def _draw_lines(ax: Axes, values: xarray.DataArray, failed: xarray.DataArray, co
         ax.legend(frameon=False, fontsize="small")
 
 
-def _draw_points(
-    ax: Axes, values: xarray.DataArray, failed: xarray.DataArray, x: xarray.DataArray, y: xarray.DataArray
+def _draw_scatter_plot(
+    ax: Axes, values: xarray.DataArray, failure_mask: xarray.DataArray, x: xarray.DataArray, y: xarray.DataArray
 ) -> None:
-    z, is_failed = values.to_numpy(), failed.to_numpy()
+    z, is_failed = values.to_numpy(), failure_mask.to_numpy()
     colours = _colour_options(z[~is_failed])
     is_drawn = ~is_failed & np.isfinite(z)
     points = ax.scatter(x.to_numpy()[is_drawn], y.to_numpy()[is_drawn], c=z[is_drawn], s=14, linewidth=0, **colours)
-    ax.figure.colorbar(points, ax=ax, label=_label(values))
+    ax.figure.colorbar(points, ax=ax, label=_label_with_unit(values))
     if is_failed.any():
         ax.plot(x.to_numpy()[is_failed], y.to_numpy()[is_failed], "x", color=GREY, markersize=5, label="failed")
         ax.legend(loc="upper left", fontsize="small", framealpha=0.9)
@@ -230,4 +234,4 @@ def _draw_points(
         coordinate_values = coordinate.to_numpy().astype(float)
         if (coordinate_values > 0.0).all() and coordinate_values.max() > 50.0 * coordinate_values.min():
             getattr(ax, f"set_{letter}scale")("log")
-        getattr(ax, f"set_{letter}label")(_label(coordinate))
+        getattr(ax, f"set_{letter}label")(_label_with_unit(coordinate))

@@ -95,7 +95,7 @@ def momentum_sphere(
     ax.computed_zorder = False  # the zorder of each piece is set here
 
     scene = _Scene(ax, solution.x)
-    conserved_quantity, changing_quantity = _conserved_and_changing(solution, system)
+    conserved_quantity, changing_quantity = _conserved_and_changing_quantity(solution, system)
     if conserved_quantity is not None:
         scene.draw_solid(conserved_quantity.function, conserved_quantity.label(0))
     if changing_quantity is not None:
@@ -121,7 +121,7 @@ def momentum_sphere(
 
 
 def _body_solution(solution: Solution, system: System) -> Solution:
-    """Return the solution of the body alone: its states, and the energy that it has left."""
+    """Return the solution of a system with baths restricted to its body: states and energy of the body."""
     x = solution.x[:, : system.body_dim]
     energy = np.asarray(_restrict_to_body(system.energy, system)(x))
     laws = dataclasses.replace(solution.laws, energy="nonincreasing")
@@ -147,16 +147,18 @@ class _Quantity:
         return float(np.ptp(self.values)) <= 1e-9 * float(np.abs(self.values).max())
 
     def label(self, index: int) -> str:
-        when = "" if self.is_constant else (" at end", " at start")[index + 1]
-        return f"{self.name}{when} ${self.values[index]:.4g}$"
+        position_label = "" if self.is_constant else (" at end", " at start")[index + 1]
+        return f"{self.name}{position_label} ${self.values[index]:.4g}$"
 
 
 SQUARED_NORM = "mu1**2 + mu2**2 + mu3**2"
 """Name of the Casimir of so(3), the square of the length of the momentum."""
 
 
-def _conserved_and_changing(solution: Solution, system: System | None) -> tuple[_Quantity | None, _Quantity | None]:
-    """Return energy and entropy, or their substitutes, as far as they are known; the conserved one first."""
+def _conserved_and_changing_quantity(
+    solution: Solution, system: System | None
+) -> tuple[_Quantity | None, _Quantity | None]:
+    """Return the conserved and the changing quantity of a run, usually energy and entropy; None if unknown."""
     energy: PointFunction | None
     entropy: PointFunction | None
     name = SQUARED_NORM
@@ -186,13 +188,17 @@ VALUES_PER_BLOCK = 8192
 
 
 def _vectorize_in_blocks(function: Callable) -> PointFunction:
-    """Vectorize a function over arrays of points of any shape, in blocks of one size so that it is compiled once."""
+    """Return a function of one point vectorized over point arrays of any shape; blocks of one size compile it once."""
     compiled_function = jax.jit(lambda x: function(x))
 
     def evaluate(points: np.ndarray) -> np.ndarray:
-        flat = points.reshape(-1, 3)
-        padded = np.concatenate([flat, np.zeros((-len(flat) % VALUES_PER_BLOCK, 3))]).reshape(-1, VALUES_PER_BLOCK, 3)
-        return np.concatenate([compiled_function(x) for x in padded])[: len(flat)].reshape(points.shape[:-1])
+        flat_points = points.reshape(-1, 3)
+        padded_blocks = np.concatenate([flat_points, np.zeros((-len(flat_points) % VALUES_PER_BLOCK, 3))]).reshape(
+            -1, VALUES_PER_BLOCK, 3
+        )
+        return np.concatenate([compiled_function(x) for x in padded_blocks])[: len(flat_points)].reshape(
+            points.shape[:-1]
+        )
 
     return evaluate
 
@@ -214,50 +220,53 @@ def _fit_quadric(states: np.ndarray) -> PointFunction | None:
 
 
 class _LevelSurface:
-    """Level surface of a function through a point, found along rays from the origin.
+    """Level surface of a function through a point, whose points are found along rays from the origin.
 
     Attributes
     ----------
     is_simple, is_closed : bool
-        Whether some ray meets it and none meets it twice; whether every ray meets it.
+        Whether some ray meets the surface and none meets it twice; whether every ray meets it.
     """
 
-    def __init__(self, function: PointFunction, point: np.ndarray, size: float):
-        self.function, self.level, self.extent = function, float(function(point)), size
-        self.radii = np.append(0.0, np.geomspace(0.01 * size, 10.0 * size, 60))
+    def __init__(self, function: PointFunction, point: np.ndarray, extent: float):
+        self.function, self.level, self.extent = function, float(function(point)), extent
+        self.radii = np.append(0.0, np.geomspace(0.01 * extent, 10.0 * extent, 60))
         meetings = self._ray_crossings(unit_sphere_grid(16, 32)).sum(axis=0)
         self.is_simple, self.is_closed = bool(meetings.max() == 1), bool((meetings == 1).all())
 
     def intersect_rays(self, directions: np.ndarray) -> np.ndarray:
-        """Return the points where rays along unit vectors (..., 3) meet the surface, NaN if they do not."""
+        """Return the points where rays along unit vectors, shape (..., 3), meet the surface; NaN for other rays."""
         has_crossing = self._ray_crossings(directions)
         first_interval = has_crossing.argmax(axis=0)
-        inner, outer = self.radii[first_interval], self.radii[first_interval + 1]
-        inner_side = self._is_above_level(inner[..., None] * directions)
+        inner_radius, outer_radius = self.radii[first_interval], self.radii[first_interval + 1]
+        inner_side = self._is_above_level(inner_radius[..., None] * directions)
         for _ in range(40):
-            midpoint = (inner + outer) / 2
+            midpoint = (inner_radius + outer_radius) / 2
             is_on_inner_side = self._is_above_level(midpoint[..., None] * directions) == inner_side
-            inner, outer = np.where(is_on_inner_side, midpoint, inner), np.where(is_on_inner_side, outer, midpoint)
-        is_hit = has_crossing.any(axis=0) & (self.is_closed | (outer <= 1.5 * self.extent))
-        return np.where(is_hit[..., None], outer[..., None] * directions, np.nan)
+            inner_radius, outer_radius = (
+                np.where(is_on_inner_side, midpoint, inner_radius),
+                np.where(is_on_inner_side, outer_radius, midpoint),
+            )
+        is_hit = has_crossing.any(axis=0) & (self.is_closed | (outer_radius <= 1.5 * self.extent))
+        return np.where(is_hit[..., None], outer_radius[..., None] * directions, np.nan)
 
-    def hides(self, points: np.ndarray, view: np.ndarray) -> np.ndarray:
-        """Return whether the surface hides points, shape (..., 3), from a distant eye in the direction ``view``."""
+    def hides(self, points: np.ndarray, view_direction: np.ndarray) -> np.ndarray:
+        """Return whether the surface hides points, shape (..., 3), from a distant viewer in a direction."""
         depths = np.geomspace(0.01, 20.0, 80) * self.extent
-        side = self._is_above_level(points + depths.reshape(-1, *[1] * points.ndim) * view)
+        side = self._is_above_level(points + depths.reshape(-1, *[1] * points.ndim) * view_direction)
         return (side[1:] != side[:-1]).any(axis=0)
 
     def _is_above_level(self, points: np.ndarray) -> np.ndarray:
         return self.function(points) > self.level
 
     def _ray_crossings(self, directions: np.ndarray) -> np.ndarray:
-        """Return the intervals of ``radii`` in which rays cross the surface, shape (intervals, ...)."""
+        """Return whether rays cross the surface in each interval of ``radii``, shape (intervals, ...)."""
         side = self._is_above_level(self.radii.reshape(-1, *[1] * directions.ndim) * directions)
         return side[1:] != side[:-1]
 
 
 class _Scene:
-    """A solid with curves around it, without the parts that the solid hides."""
+    """3D axes in which a solid and curves around it are drawn, without the parts of curves that the solid hides."""
 
     def __init__(self, ax: Axes3D, states: np.ndarray):
         self.ax, self.states, self.view_direction = ax, states, _view_direction(ax)
@@ -265,7 +274,7 @@ class _Scene:
         self.solid: _LevelSurface | None = None
 
     def draw_solid(self, function: PointFunction, label: str) -> None:
-        """Draw the level surface of the function through the first state, with its outline; sections if it is open."""
+        """Draw the level surface of a function through the first state as a solid, or its sections if it is open."""
         surface = _LevelSurface(function, self.states[0], self.extent)
         if not surface.is_closed:
             self.draw_level_surface(function, 0, GREY, label)
@@ -282,11 +291,11 @@ class _Scene:
         for line in _level_curves(self.mesh, normals @ self.view_direction, 0.0):
             self._draw_line(line, color=GREY, linewidth=0.8)
 
-    def draw_contours(self, function: PointFunction, count: int) -> None:
+    def draw_contours(self, function: PointFunction, n_contours: int) -> None:
         """Draw curves on the solid along which the function is constant."""
         if self.solid is not None:
             values = function(self.mesh)
-            for level in np.linspace(values.min(), values.max(), count + 2)[1:-1]:
+            for level in np.linspace(values.min(), values.max(), n_contours + 2)[1:-1]:
                 self._draw_contour(values, level, color=GREY, linewidth=0.4)
 
     def draw_level_surface(self, function: PointFunction, index: int, color: str, label: str) -> None:
@@ -365,7 +374,7 @@ def _great_circle(normal: np.ndarray) -> np.ndarray:
 
 
 def _view_direction(ax: Axes3D) -> np.ndarray:
-    """Return the unit vector towards the eye."""
+    """Return the unit vector from the origin towards the viewer of the axes."""
     elevation, azimuth = np.radians([ax.elev, ax.azim])
     return np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
 
@@ -413,7 +422,7 @@ def sphere_field(
     if field.ndim != 2 or min(field.shape) < 2 or field.dtype.kind not in "fiu":
         raise InputError(f"values must be real numbers of shape (latitudes, longitudes), got shape {np.shape(values)}")
     if not np.isfinite(field).all():
-        raise InputError("values must be finite")
+        raise InputError("values must be finite, got NaN or infinity")
     if ax is None:
         ax = plt.figure(figsize=(6.4, 3.4), dpi=DPI, layout="constrained").add_subplot(projection="mollweide")
     elif getattr(ax, "name", "") != "mollweide":

@@ -23,7 +23,7 @@ from ...functions.mechanics import Each
 
 
 class Subsystem(Module):
-    """One body of a composed system: its energy in its own state (q, p, S), and its friction.
+    """A body of a composed system, with the energy of its own state (q, p, S) and its friction.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class Subsystem(Module):
         self.energy = with_polynomial_degrees(
             checked_energy(energy, dim, f"the energy of {name or 'a subsystem'}"), dim
         )
-        self.friction = _check_friction(friction, dim - species, name or "a subsystem")
+        self.friction = _checked_friction(friction, dim - species, name or "a subsystem")
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -70,18 +70,19 @@ class Subsystem(Module):
 
     @property
     def count(self) -> int:
-        """Number of bodies."""
+        """Number of bodies, which is 1."""
         return 1
 
-    def energy_in_state(self, start: int) -> Energy:
-        """Return the energy as a function of a whole state, in which the body begins at index ``start``."""
-        return self.energy.on(np.arange(start, start + self.dim))
+    def energy_of_whole_state(self, start_index: int) -> Energy:
+        """Return the energy as a function of the whole state, in which the body begins at ``start_index``."""
+        return self.energy.on(np.arange(start_index, start_index + self.dim))
 
 
 class Copies(Module):
-    """Many bodies of one kind in a composed system: ``H_a(q_a, p_a, S_a)`` is one function with parameters of its own.
+    """Many bodies of one kind in a composed system, with one energy function and parameters for each body.
 
-    What it costs to trace and to compile does not grow with their number, so there can be 1e5 of them.
+    The energy of body a is ``H_a(q_a, p_a, S_a)``. The costs of tracing and compiling do not grow with the number of
+    bodies, so there can be 1e5 of them.
 
     Parameters
     ----------
@@ -115,10 +116,12 @@ class Copies(Module):
         _check_dim(dim)
         self.count, self.dim, self.name = count, dim, name
         self.energy = Quadratic(jnp.zeros(dim)) if energy is None else energy
-        given = parameters if isinstance(parameters, tuple) else (parameters,)
-        self.parameters = tuple(checked_numbers(a, f"the parameters of {name or 'the bodies'}") for a in given)
-        self.energy_in_state(0)  # checked there
-        self.friction = _check_copies_friction(friction, count, dim, name or "the bodies")
+        parameter_tuple = parameters if isinstance(parameters, tuple) else (parameters,)
+        self.parameters = tuple(
+            checked_numbers(a, f"the parameters of {name or 'the bodies'}") for a in parameter_tuple
+        )
+        self.energy_of_whole_state(0)  # checked there
+        self.friction = _checked_copies_friction(friction, count, dim, name or "the bodies")
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -126,20 +129,20 @@ class Copies(Module):
 
     @property
     def species(self) -> int:
-        """Kinds of particles: copies hold none."""
+        """Number of kinds of particles, which is 0: copies hold no matter."""
         return 0
 
-    def energy_in_state(self, start: int) -> Energy:
-        """Return the energy as a function of a whole state, in which the first body begins at index ``start``."""
-        places = np.arange(start, start + self.count * self.dim).reshape(self.count, self.dim)
-        return Each(self.energy, places, *self.parameters)
+    def energy_of_whole_state(self, start_index: int) -> Energy:
+        """Return the energy of all as a function of the whole state, in which they begin at ``start_index``."""
+        indices = np.arange(start_index, start_index + self.count * self.dim).reshape(self.count, self.dim)
+        return Each(self.energy, indices, *self.parameters)
 
 
 # -- arguments --------------------------------------------------------------------------------------------------------
 
 
 def name_subsystems(subsystems) -> tuple[tuple[str, ...], tuple[Subsystem | Copies, ...]]:
-    """Return a name for each subsystem, and the subsystems; raise InputError if one is of another type."""
+    """Return a name for each subsystem, and the subsystems as a tuple; InputError for objects of other types."""
     if isinstance(subsystems, Mapping):
         names, bodies = tuple(map(str, subsystems)), tuple(subsystems.values())
     else:
@@ -159,11 +162,13 @@ def name_subsystems(subsystems) -> tuple[tuple[str, ...], tuple[Subsystem | Copi
 
 
 def _check_dim(dim) -> None:
+    """Raise InputError unless dim is 2n + 1, or 1."""
     if isinstance(dim, bool) or not isinstance(dim, int) or dim < 1 or dim % 2 == 0:
         raise InputError(f"dim, the size of a state (q, p, S), must be 2n + 1, or 1 for S alone, got {dim!r}")
 
 
-def _check_friction(friction, dim: int, name: str):
+def _checked_friction(friction, dim: int, name: str):
+    """Return the friction of a body as a checked array, shape (n,) or (n, n), function, "contact" or None."""
     n = dim // 2
     if friction is None:
         return None
@@ -183,9 +188,10 @@ def _check_friction(friction, dim: int, name: str):
     return _require_nonnegative(R, name)
 
 
-def _check_copies_friction(friction, count: int, dim: int, name: str):
+def _checked_copies_friction(friction, count: int, dim: int, name: str):
+    """Return the friction of copies of a body as a checked array, shape (count, n), "contact" or None."""
     if friction is None or isinstance(friction, str):
-        return _check_friction(friction, dim, name)
+        return _checked_friction(friction, dim, name)
     n, R = dim // 2, checked_numbers(friction, f"friction of {name}")
     if n == 0 or R.shape not in ((), (n,), (count, n)):
         raise InputError(
@@ -196,12 +202,15 @@ def _check_copies_friction(friction, count: int, dim: int, name: str):
 
 
 def _require_nonnegative(R: jax.Array, name: str) -> jax.Array:
+    """Return the friction coefficients R; InputError if one is negative."""
     require_condition(R.min(), lambda r: r >= 0.0, f"friction of {name} must be >= 0, got {{value:g}}")
     return R
 
 
 class Membrane(Module):
-    """A membrane that lets particles pass between two bodies: ``N_1' = L (mu_2 / T_2 - mu_1 / T_1 + …) = -N_2'``.
+    """A membrane through which particles pass between two bodies, driven by their chemical potentials.
+
+    The numbers change by ``N_1' = L (mu_2 / T_2 - mu_1 / T_1 + …) = -N_2'``.
 
     Between equal temperatures ``J = L (mu_2 - mu_1) / T``; what the particles lose heats either body by half. Between
     bodies of different temperature the flux is driven by ``e (1/T_1 - 1/T_2) - (mu_1/T_1 - mu_2/T_2)``, with the energy
@@ -237,14 +246,14 @@ class Membrane(Module):
             self.carries, lambda s: abs(s) < np.inf, "the entropy that a particle carries must be finite, got {value}"
         )
 
-    def process(self, names: Sequence[str], structure: mf.ExtendedPhaseSpace) -> Process:
-        """Return the process of the membrane between bodies of the given names, in states of a structure."""
-        a, b = (_body_index(body, names) for body in (self.first, self.second))
+    def make_process(self, body_names: Sequence[str], structure: mf.ExtendedPhaseSpace) -> Process:
+        """Return the membrane as a :class:`Process` between bodies with ``body_names``, in states of a structure."""
+        a, b = (_body_index(body, body_names) for body in (self.first, self.second))
         if a == b:
-            raise InputError(f"a membrane must join two bodies, got {names[a]} twice")
-        stoichiometry, sides = np.zeros(len(structure.particle_indices.N)), np.zeros((2, len(names)))
+            raise InputError(f"a membrane must join two bodies, got {body_names[a]} twice")
+        stoichiometry, sides = np.zeros(len(structure.particle_indices.N)), np.zeros((2, len(body_names)))
         for body, kind, sign in ((a, self.species[0], 1.0), (b, self.species[1], -1.0)):
-            stoichiometry[_particle_index(body, kind, names, structure.particle_indices)] = sign
+            stoichiometry[_particle_index(body, kind, body_names, structure.particle_indices)] = sign
             sides[:, body] = 0.5, sign
         numbers, heat_shares, entropy_transport = (tuple(row.tolist()) for row in (stoichiometry, *sides))
         L = _checked_state_function(self.permeability, structure.dim, "the permeability of a membrane")
@@ -252,7 +261,9 @@ class Membrane(Module):
 
 
 class Reaction(Module):
-    """A reaction among the particles of a body, ``N' = nu L A / T`` with the affinity ``A = -nu . mu``.
+    """A chemical reaction among the particles of a body, driven by its affinity.
+
+    It obeys ``N' = nu L A / T`` with the affinity ``A = -nu . mu``.
 
     It rests where ``nu . mu = 0``, the law of mass action of ideal gases. The rates of mass action themselves are those
     of ``L = (k_f prod n_educts - k_b prod n_products) T / A``, which is positive.
@@ -278,24 +289,25 @@ class Reaction(Module):
             raise InputError(f"the stoichiometry of a reaction must be a row of finite numbers, got {numbers.tolist()}")
         self.stoichiometry = tuple(numbers.tolist())
 
-    def process(self, names: Sequence[str], structure: mf.ExtendedPhaseSpace) -> Process:
-        """Return the process of the reaction among bodies of the given names, in states of a structure."""
-        body = _body_index(self.body, names)
+    def make_process(self, body_names: Sequence[str], structure: mf.ExtendedPhaseSpace) -> Process:
+        """Return the reaction as a :class:`Process` among bodies with ``body_names``, in states of a structure."""
+        body = _body_index(self.body, body_names)
         matter = structure.particle_indices
         indices = np.flatnonzero(matter.owner == body)
         if len(indices) != len(self.stoichiometry):
             raise InputError(
-                f"a reaction in {names[body]} must have {len(indices)} stoichiometric numbers, "
+                f"a reaction in {body_names[body]} must have {len(indices)} stoichiometric numbers, "
                 f"got {len(self.stoichiometry)}"
             )
-        stoichiometry, heat_shares = np.zeros(len(matter.N)), np.zeros(len(names))
+        stoichiometry, heat_shares = np.zeros(len(matter.N)), np.zeros(len(body_names))
         stoichiometry[indices], heat_shares[body] = self.stoichiometry, 1.0
-        no_transport = (0.0,) * len(names)
+        no_transport = (0.0,) * len(body_names)
         L = _checked_state_function(self.rate, structure.dim, "the rate of a reaction")
         return Process(tuple(stoichiometry.tolist()), tuple(heat_shares.tolist()), no_transport, jnp.zeros(()), L)
 
 
 def _checked_coefficient(coefficient, what: str) -> jax.Array | Callable:
+    """Return a coefficient as a nonnegative number, shape (), or a function unchanged."""
     if callable(coefficient):
         return coefficient
     value = checked_numbers(coefficient, what, ())
@@ -304,24 +316,30 @@ def _checked_coefficient(coefficient, what: str) -> jax.Array | Callable:
 
 
 def _checked_state_function(coefficient, dim: int, what: str) -> jax.Array | Callable:
-    """Return a coefficient; a function is checked on states of shape (dim,)."""
+    """Return a coefficient unchanged, or traced and checked if it is a function of the whole state."""
     if not callable(coefficient):
         return coefficient
     return traced_function_and_shape(coefficient, [(dim,)], [()], what, f"a state of shape ({dim},)")[0]
 
 
-def _body_index(body, names: Sequence[str]) -> int:
-    if isinstance(body, str) and body in names:
-        if list(names).count(body) > 1:
+def _body_index(body, body_names: Sequence[str]) -> int:
+    """Return the index of a body that is given by number or by name; InputError if there is none."""
+    if isinstance(body, str) and body in body_names:
+        if list(body_names).count(body) > 1:
             raise InputError(f"{body!r} is the name of several bodies. Give the number of a body instead")
-        return list(names).index(body)
-    if isinstance(body, int) and not isinstance(body, bool) and 0 <= body < len(names):
+        return list(body_names).index(body)
+    if isinstance(body, int) and not isinstance(body, bool) and 0 <= body < len(body_names):
         return body
-    raise InputError(f"there is no body {body!r}. The bodies are {', '.join(names)}, counted from 0")
+    raise InputError(f"there is no body {body!r}. The bodies are {', '.join(body_names)}, counted from 0")
 
 
-def _particle_index(body: int, kind: int, names: Sequence[str], matter: ParticleIndices) -> int:
-    indices = np.flatnonzero(matter.owner == body)
-    if not 0 <= kind < len(indices):
-        raise InputError(f"{names[body]} has {len(indices)} kinds of particles, counted from 0, got the kind {kind}")
-    return int(indices[kind])
+def _particle_index(
+    body_index: int, kind_index: int, body_names: Sequence[str], particle_indices: ParticleIndices
+) -> int:
+    """Return the index of a particle number among all, for a kind of particles of a body."""
+    indices = np.flatnonzero(particle_indices.owner == body_index)
+    if not 0 <= kind_index < len(indices):
+        raise InputError(
+            f"{body_names[body_index]} has {len(indices)} kinds of particles, counted from 0, got the kind {kind_index}"
+        )
+    return int(indices[kind_index])

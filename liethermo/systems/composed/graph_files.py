@@ -18,7 +18,7 @@ from ...functions.edges import graph_edges
 
 @dataclass(frozen=True)
 class Graph:
-    """A weighted graph with names for its nodes.
+    """A weighted graph with named nodes, read from a file.
 
     Attributes
     ----------
@@ -93,15 +93,17 @@ _EdgeList = list[tuple[str, str, str, float]]
 
 
 def _read_csv(path: Path, weight: str) -> tuple[tuple[str, ...] | None, _EdgeList]:
-    """Return the nodes in the order of their first edges, and the edges with their locations in the file."""
+    """Return the node names and the edges of a CSV file; an edge is (location, source, target, weight)."""
     edges: _EdgeList = []
     try:
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
             titles = reader.fieldnames or []
-            lacking = [title for title in ("source", "target", weight) if title not in titles]
-            if lacking:
-                raise InputError(f"{path} has no column {lacking[0]!r} in its first line, but {', '.join(titles)}")
+            missing_titles = [title for title in ("source", "target", weight) if title not in titles]
+            if missing_titles:
+                raise InputError(
+                    f"{path} has no column {missing_titles[0]!r} in its first line, but {', '.join(titles)}"
+                )
             for row in reader:
                 location = f"line {reader.line_num}"
                 source, target = ((row[title] or "").strip() for title in ("source", "target"))
@@ -115,6 +117,7 @@ def _read_csv(path: Path, weight: str) -> tuple[tuple[str, ...] | None, _EdgeLis
 
 
 def _read_graphml(path: Path, weight: str) -> tuple[tuple[str, ...] | None, _EdgeList]:
+    """Return the node names and the edges of a GraphML file; an edge is (location, source, target, weight)."""
     try:
         import networkx
     except ImportError as error:
@@ -132,14 +135,17 @@ def _read_graphml(path: Path, weight: str) -> tuple[tuple[str, ...] | None, _Edg
 
 
 def _declared_nodes(path: Path) -> tuple[str, ...]:
-    """Return the nodes that a GraphML file declares; networkx adds those that only an edge names."""
+    """Return the names of the nodes that a GraphML file declares, without those that only an edge names."""
     elements = ElementTree.parse(path).iter()
     return tuple(element.attrib["id"] for element in elements if element.tag.rsplit("}")[-1] == "node")
 
 
-def _node_names(file_names: Iterable[str] | None, nodes, path: Path) -> tuple[str, ...]:
+def _node_names(file_names: Iterable[str] | None, requested_nodes, path: Path) -> tuple[str, ...]:
+    """Return the node names in the order of states: those that the user requested, or those of the file."""
     names = (
-        tuple(file_names or ()) if nodes is None else tuple(map(str, range(nodes) if isinstance(nodes, int) else nodes))
+        tuple(file_names or ())
+        if requested_nodes is None
+        else tuple(map(str, range(requested_nodes) if isinstance(requested_nodes, int) else requested_nodes))
     )
     if not names:
         raise InputError(f"{path} has no nodes")
@@ -149,6 +155,7 @@ def _node_names(file_names: Iterable[str] | None, nodes, path: Path) -> tuple[st
 
 
 def _parse_weight(text, weight: str, location: str) -> float:
+    """Return the weight of an edge as a number; InputError if its text is none."""
     try:
         return float(text)
     except (TypeError, ValueError):

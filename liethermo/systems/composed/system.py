@@ -42,7 +42,7 @@ from .bodies import Copies, Membrane, Reaction, Subsystem, name_subsystems
 
 
 class ComposedSystem(System):
-    """Bodies with their own (q, p, S), a coupling potential, heat conduction and friction [SML §5, Examples 2-4].
+    """Bodies with states (q, p, S), coupled by a potential, heat conduction and friction [SML §5, Examples 2-4].
 
     ``q_a' = H_{p_a}``, ``p_a' = -H_{q_a}`` and friction, ``S_a' = sum_b k_ab (T_b - T_a) / T_a`` and the heat of
     friction, with ``H = sum_a H_a(q_a, p_a, S_a) + V(q, S)`` and temperatures ``T_a = H_{S_a}``. The state is
@@ -137,7 +137,7 @@ class ComposedSystem(System):
                 raise InputError(
                     f"membranes and reactions must be lt.Membrane and lt.Reaction, got {type(item).__name__}"
                 )
-        processes = [item.process(self.names, structure) for item in exchanges]
+        processes = [item.make_process(self.names, structure) for item in exchanges]
         if processes:
             terms.append(MatterExchange(processes))
         momentum_maps = {**_particle_invariants(structure, processes), **name_momentum_maps(momentum_maps)}
@@ -217,9 +217,10 @@ class ComposedSystem(System):
 
     @property
     def sparse_newton(self) -> SparseNewton:
-        return SparseNewton(self._find_pattern, self._residual_weights)
+        return SparseNewton(self._find_jacobian_pattern, self._residual_weights)
 
-    def _find_pattern(self) -> scipy.sparse.csr_array | None:
+    def _find_jacobian_pattern(self) -> scipy.sparse.csr_array | None:
+        """Return the sparsity pattern of the Jacobian of the field, shape (n, n); None if it is not known."""
         if self.poisson.species:
             return None
         patterns = (term.force_pattern(self) for term in self.total_dissipation.terms)
@@ -233,7 +234,10 @@ class ComposedSystem(System):
         return pattern_of_matrix((operator + identity) @ (hessian + identity))
 
     def _residual_weights(self, x) -> jax.Array:
-        """Return temperatures as weights of entropies: ``T S'`` is linear in the temperatures, unlike S'."""
+        """Return weights of the equations of a step, shape (n,): temperatures for entropies, otherwise 1.
+
+        ``T S'`` is linear in the temperatures, but S' is not.
+        """
         S = self._state_indices.S
         return jnp.ones_like(x).at[S].set(self.energy.gradient(x)[S])
 
@@ -245,12 +249,13 @@ class ComposedSystem(System):
 
     @property
     def _subsystem_offsets(self) -> np.ndarray:
-        """Index of the first component of each subsystem, followed by the dimension of the state."""
+        """Index of the first component of each subsystem in a state, and the dimension of the state."""
         return np.cumsum([0, *(body.count * body.dim for body in self.subsystems)])
 
     def _total_energy(self, structure: mf.ExtendedPhaseSpace, coupling) -> Energy:
+        """Return the sum of the energies of the bodies and of the coupling, as a function of the whole state."""
         terms = [
-            body.energy_in_state(int(start))
+            body.energy_of_whole_state(int(start))
             for body, start in zip(self.subsystems, self._subsystem_offsets[:-1], strict=True)
         ]
         if coupling is not None:
@@ -260,6 +265,7 @@ class ComposedSystem(System):
         return sum(terms[1:], terms[0])
 
     def _make_dissipations(self, structure, energy, conductance, drag, connected, conduction) -> list[Dissipation]:
+        """Return the dissipations for friction, heat conduction and drag of the bodies, in a list."""
         terms: list[Dissipation] = []
         dofs = structure.degrees_of_freedom
         first_indices = np.cumsum([0, *(body.count for body in self.subsystems)])
@@ -299,13 +305,13 @@ class ComposedSystem(System):
     def _friction_surely_produces_entropy(
         self, energy: Energy, structure: mf.ExtendedPhaseSpace, bodies: tuple[int, ...]
     ) -> bool:
-        """Return whether contact friction in some bodies is known to produce entropy.
+        """Return whether contact friction in ``bodies`` is known to produce entropy.
 
         It is for energies of which :func:`.is_kinetic_plus_potential` is true.
         """
         if is_traced(energy):
             return False
-        n_body_terms = sum(len(body.energy_in_state(0).terms) for body in self.subsystems)
+        n_body_terms = sum(len(body.energy_of_whole_state(0).terms) for body in self.subsystems)
         momenta = structure.state_indices.p[np.isin(structure.state_indices.owner, bodies)]
         points = np.random.default_rng(0).standard_normal((2, structure.dim))
         return all(
@@ -316,6 +322,7 @@ class ComposedSystem(System):
 
 
 def _energy_gradient(system: System, x) -> jax.Array:
+    """Return the gradient of the energy at one state, shape (n,)."""
     return system.energy.gradient(x)
 
 
@@ -324,7 +331,7 @@ MAX_NAMED_BODIES = 3
 
 
 def _poisson_pattern(structure: mf.ExtendedPhaseSpace) -> scipy.sparse.csr_array:
-    """Return the sparsity pattern of the Poisson tensor."""
+    """Return the sparsity pattern of the Poisson tensor, shape (n, n)."""
     q, p, _, _ = structure.state_indices
     return sparsity_pattern(np.concatenate([q, p]), np.concatenate([p, q]), structure.dim)
 
@@ -333,13 +340,13 @@ def _poisson_pattern(structure: mf.ExtendedPhaseSpace) -> scipy.sparse.csr_array
 
 
 def _diagonal_friction(body: Subsystem | Copies) -> jax.Array | None:
-    """Return the diagonal friction of a subsystem, an entry for each momentum; None if it has another friction."""
+    """Return the diagonal friction of a subsystem, shape (momenta,); None if its friction is not diagonal."""
     R = body.friction
     return R.ravel() if isinstance(R, jax.Array) and (R.ndim == 1 or isinstance(body, Copies)) else None
 
 
 def _coupling_energy(V, structure: mf.ExtendedPhaseSpace) -> Energy:
-    """Return a coupling as an Energy of the whole state."""
+    """Return the coupling V as an energy of the whole state."""
     if isinstance(V, Energy):
         return V
     if not callable(V):
@@ -355,7 +362,7 @@ def _coupling_energy(V, structure: mf.ExtendedPhaseSpace) -> Energy:
 
 
 class _SplitArguments(Module):
-    """A function of one array (and t), from V(q, S) or V(q, S, N) (and t)."""
+    """A function of one array and t, computed from V(q, S, t) or V(q, S, N, t); t may be missing."""
 
     V: Callable
     split_indices: tuple[int, ...] = eqx.field(static=True)
@@ -365,7 +372,7 @@ class _SplitArguments(Module):
 
 
 def _particle_invariants(structure: mf.ExtendedPhaseSpace, processes: Sequence[Process]) -> dict[str, Energy]:
-    """Return the sums of particle numbers that no process changes, by name."""
+    """Return the sums of particle numbers that no process changes, by name, as functions of the state."""
     N = structure.particle_indices.N
     invariants: dict[str, Energy] = {}
     for i, weights in enumerate(conserved_number_combinations(processes, len(N)) if len(N) else ()):
@@ -375,13 +382,13 @@ def _particle_invariants(structure: mf.ExtendedPhaseSpace, processes: Sequence[P
     return invariants
 
 
-def _split_conductances(conductance, bodies: int) -> tuple[Any, list[tuple[int, int, Callable]]]:
-    """Return conductances with functions replaced by 1, and the edges (i, j, function) with functions."""
+def _split_conductances(conductance, n_bodies: int) -> tuple[Any, list[tuple[int, int, Callable]]]:
+    """Return the conductances with 1 in place of functions, and the edges (i, j, function)."""
     if callable(conductance):
         conductance = [(0, 1, conductance)]
-        if bodies != 2:
+        if n_bodies != 2:
             raise InputError(
-                f"a conductance given as one function needs two bodies, got {bodies}. Give edges (i, j, function)"
+                f"a conductance given as one function needs two bodies, got {n_bodies}. Give edges (i, j, function)"
             )
     is_edge_list = isinstance(conductance, list | tuple) and all(isinstance(edge, tuple) for edge in conductance)
     functions = [edge for edge in conductance if any(map(callable, edge))] if is_edge_list else []
@@ -390,20 +397,22 @@ def _split_conductances(conductance, bodies: int) -> tuple[Any, list[tuple[int, 
     return [tuple(1.0 if callable(entry) else entry for entry in edge) for edge in conductance], functions
 
 
-def _conduction_laws(graph: Edges, functions, dim: int, names: tuple[str, ...]) -> tuple[Callable, ...]:
-    """Return a checked function of (T_i, T_j, x) for each edge of a graph: its weight if no function is given."""
+def _conduction_laws(
+    graph: Edges, edges_with_functions, state_dim: int, body_names: tuple[str, ...]
+) -> tuple[Callable, ...]:
+    """Return for each edge of a graph a checked function of (T_i, T_j, x): its constant weight if none is given."""
     laws = {}
-    for i, j, k in functions:
+    for i, j, k in edges_with_functions:
         law = k if required_argument_count(k) == 3 else LastArgumentIgnored(k)
-        what = f"the conductance between {names[int(i)]} and {names[int(j)]}"
-        law, _ = traced_function_and_shape(law, ((), (), (dim,)), [()], what, "(T_i, T_j), or (T_i, T_j, x)")
+        what = f"the conductance between {body_names[int(i)]} and {body_names[int(j)]}"
+        law, _ = traced_function_and_shape(law, ((), (), (state_dim,)), [()], what, "(T_i, T_j), or (T_i, T_j, x)")
         laws[min(i, j), max(i, j)] = law if i < j else _SwappedLaw(law)
     edges = zip(graph.first.tolist(), graph.second.tolist(), graph.weight, strict=True)
     return tuple(laws.get((i, j), ConstantFunction(weight)) for i, j, weight in edges)
 
 
 class _SwappedLaw(Module):
-    """A conduction law with its two bodies exchanged."""
+    """A conduction law with the two bodies exchanged."""
 
     law: Callable
 
@@ -411,22 +420,24 @@ class _SwappedLaw(Module):
         return self.law(T_j, T_i, x)
 
 
-def _require_connected(graph: Edges, names: tuple[str, ...]) -> None:
-    labels = connected_component_labels(graph, len(names))
+def _require_connected(graph: Edges, body_names: tuple[str, ...]) -> None:
+    """Raise InputError if the graph of conductances is not connected."""
+    labels = connected_component_labels(graph, len(body_names))
     if labels.max() > 0:
-        examples = [" and ".join(np.array(names)[labels == i][:2]) for i in (0, 1)]
+        examples = [" and ".join(np.array(body_names)[labels == i][:2]) for i in (0, 1)]
         raise InputError(
             f"the conductance has {labels.max() + 1} parts that exchange no heat, such as that of {examples[0]} and "
             f"that of {examples[1]}. Use connected=False to allow this"
         )
 
 
-def _require_equal_velocity_counts(graph: Edges, dofs: tuple[int, ...], names: tuple[str, ...]) -> None:
+def _require_equal_velocity_counts(graph: Edges, dofs: tuple[int, ...], body_names: tuple[str, ...]) -> None:
+    """Raise InputError if drag acts between bodies with different numbers of velocities."""
     n = np.array(dofs)
     bad = np.flatnonzero((n[graph.first] != n[graph.second]) | (n[graph.first] == 0))
     if bad.size:
         i, j = graph.first[bad[0]], graph.second[bad[0]]
         raise InputError(
-            f"drag between {names[i]} and {names[j]} needs velocities of the same kind, but they have {dofs[i]} "
-            f"and {dofs[j]} degrees of freedom"
+            f"drag between {body_names[i]} and {body_names[j]} needs velocities of the same kind, but they have "
+            f"{dofs[i]} and {dofs[j]} degrees of freedom"
         )

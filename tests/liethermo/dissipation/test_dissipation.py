@@ -80,7 +80,7 @@ def discrete_properties(system, g):
     x = points(g)
     dH = jax.vmap(system.energy.gradient)(x) + 0.1 * rng.standard_normal(x.shape)  # not the gradient of H anywhere
     dS = jax.vmap(system.entropy.gradient)(x)
-    dL = tuple(jax.vmap(L.gradient)(x) + 0.1 * rng.standard_normal(x.shape) for L in system.preserved)
+    dL = tuple(jax.vmap(L.gradient)(x) + 0.1 * rng.standard_normal(x.shape) for L in system.preserved_functions)
     energy_residuals, productions = jax.vmap(at)(x, dH, dS, dL)
     return float(jnp.max(jnp.abs(energy_residuals))), float(jnp.min(productions))
 

@@ -41,7 +41,11 @@ def measure_factors(system, x, dH, dS, dL):
 
     def matrix(y):
         terms_at_y = noisy_terms_with_factors(
-            system.dissipation, system, y, system.energy.gradient(y), [L.gradient(y) for L in system.preserved]
+            system.dissipation,
+            system,
+            y,
+            system.energy.gradient(y),
+            [L.gradient(y) for L in system.preserved_functions],
         )
         return jnp.concatenate([jax.vmap(B.times)(jnp.eye(B.size)) for _, B in terms_at_y])
 
@@ -62,7 +66,7 @@ def test_factors(g, case):
     for seed in range(3):
         x = jnp.asarray(state_of(g, seed))
         dH = system.energy.gradient(x) + 0.1 * rng.standard_normal(g.dim)
-        dL = tuple(L.gradient(x) + 0.1 * rng.standard_normal(g.dim) for L in system.preserved)
+        dL = tuple(L.gradient(x) + 0.1 * rng.standard_normal(g.dim) for L in system.preserved_functions)
         product, kernel, defect = measure_factors(system, x, dH, rng.standard_normal(g.dim), dL)
         assert product < 1e-13
         assert kernel < 1e-13 * float(jnp.linalg.norm(dH))

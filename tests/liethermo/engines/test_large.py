@@ -138,7 +138,7 @@ def test_newtons_method_is_compiled_when_a_step_needs_it():
         start = engine.initial_run_state(jnp.array([0.1, 1.0, 0.1]))
         lazy_state, lazy_saves = engine.advance(start, h, 4, 2)
         assert engine._lazy_newton.has_newton is needs_newton
-        state, saves = array_engine.advance(
+        state, saves = array_engine.take_steps_and_save(
             system, engine.method, start, *map(jnp.asarray, (h, 4, 2)), engine.max_saves_per_call
         )
         assert int(lazy_state.step) == int(state.step) == 8
@@ -150,13 +150,13 @@ def test_steps_before_newtons_method_is_needed_are_not_taken_again(monkeypatch):
     body = lt.LiePoissonSystem(
         mf.so(3), lambda p: 0.5 * p @ (p / jnp.array([3.0, 2.0, 1.0])), torque=lambda t, mu: jnp.array([0.5, 0.4, 0.3])
     )
-    calls, advance = [], array_engine.advance
+    calls, advance = [], array_engine.take_steps_and_save
 
     def recording_advance(system, method, state, *arguments):
         calls.append((int(state.step), arguments[-2]))
         return advance(system, method, state, *arguments)
 
-    monkeypatch.setattr(array_engine, "advance", recording_advance)
+    monkeypatch.setattr(array_engine, "take_steps_and_save", recording_advance)
     system, method = prepare_system_and_method(body, lt.MetriplecticMidpoint())
     engine = array_engine.ArrayEngine(system, method)
     start = engine.initial_run_state(checked_initial_state(system, method, [0.1, 0.1, 0.1], 0.0))

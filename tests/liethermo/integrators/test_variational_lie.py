@@ -39,7 +39,7 @@ def coupled_system():
 def residuals(system, x):
     """Return the residuals of d/dt l_xi = ad*_xi l_xi + f, T S' = -f . xi, and E' = 0, and S'."""
     xi, S, rate = x[:-1], x[-1], system.vector_field(x)
-    mu, W, dmu_dS = system.poisson.momentum_derivatives(x)
+    mu, W, dmu_dS = system.poisson.momentum_and_derivatives(x)
     force = system.friction_force(xi, S)
     return {
         "momentum": W @ rate[:-1] + dmu_dS * rate[-1] - system.algebra.ad_star(xi, mu) - force,

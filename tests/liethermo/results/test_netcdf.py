@@ -232,7 +232,9 @@ def test_a_run_that_cannot_be_kept_is_not_lost(tmp_path, monkeypatch, step):
     warns_and_continues = pytest.warns(UserWarning, match="the disk is full .*The run goes on")
     with (
         warns_and_continues,
-        pytest.raises(lt.FileError, match=r"the disk is full .*It is the exception's \.solution") as error_info,
+        pytest.raises(
+            lt.FileError, match=r"the disk is full .*The exception has this result as \.solution"
+        ) as error_info,
     ):
         lt.integrate(body, x0, (0.0, 2.0), step, save_to=tmp_path / "run.nc")
     monkeypatch.undo()

@@ -381,7 +381,7 @@ def test_an_exception_of_an_event_function_is_the_users_own():
 @pytest.mark.parametrize(
     ("until", "message"),
     [
-        ([], "an event at least"),
+        ([], "at least one event"),
         ([lambda a, b, c: 0.0], r"must have the arguments \(x\) or \(t, x\)"),
         ([lambda x: x[0], 3.0], r"lt\.Relaxed\(tol\) or a function"),
         (with_attributes(lambda x: x[0], terminal=-1), "terminal must be True or the number"),

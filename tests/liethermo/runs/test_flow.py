@@ -12,7 +12,7 @@ import scipy.optimize
 import liethermo as lt
 import manifolds as mf
 from liethermo.runs import flow as flow_module
-from liethermo.runs.flow_derivatives import implicit_solution
+from liethermo.runs.flow_derivatives import solve_with_implicit_derivative
 
 X0 = jnp.array([0.3, 1.0, 0.2])
 PARAMETERS = jnp.array([10.0, 5.0, 1.0, 1.0])
@@ -93,7 +93,7 @@ def test_newton_is_compiled_where_a_step_needs_it(monkeypatch):
     def raise_needed(equations):
         raise NewtonCompiled
 
-    monkeypatch.setattr(flow_module, "solve_or_nan", raise_needed)
+    monkeypatch.setattr(flow_module, "solve_stages_or_nan", raise_needed)
 
     def end(x, h=0.125):
         return jnp.sum(lt.flow(nonlinear(PARAMETERS), x, (0.0, 4 * h), h) ** 3)
@@ -221,7 +221,9 @@ def root(p, x):
         p, x = parameters
         return y + 0.5 * p * jnp.sin(y) - x
 
-    return jax.lax.scan(lambda x, _: (implicit_solution(solve, misfit, (p, x), x), None), x[None], length=3)[0][0]
+    return jax.lax.scan(
+        lambda x, _: (solve_with_implicit_derivative(solve, misfit, (p, x), x), None), x[None], length=3
+    )[0][0]
 
 
 @pytest.mark.slow
@@ -239,7 +241,9 @@ def test_implicit_functions_have_derivatives_of_derivatives():
         derivatives = [jax.jit(jax.vmap(f, (None, 0)))(p, x) for f in (slopes, outer(slopes, 1))]
         assert np.abs(derivatives[0] - y_first).max() < 1e-12
         assert np.abs(derivatives[1] - second).max() < 1e-12
-    guess_derivative = jax.grad(lambda guess: implicit_solution(lambda p, guess: p, lambda p, y: y - p, p, guess))(0.0)
+    guess_derivative = jax.grad(
+        lambda guess: solve_with_implicit_derivative(lambda p, guess: p, lambda p, y: y - p, p, guess)
+    )(0.0)
     assert guess_derivative == 0.0
     second_derivatives = (
         jax.jit(jax.jacrev(jax.jacrev(root, 0), 0))(p, x[0]),

@@ -236,10 +236,10 @@ def test_an_interruption_stops_all_groups(monkeypatch):
     from liethermo.runs.ensemble_lanes import FixedEnsembleRun
 
     def count_call(run):
-        calls.append(len(run.record.x0))
+        calls.append(len(run.group.x0))
 
     calls: list[int] = []
-    monkeypatch.setattr(FixedEnsembleRun, "run_compiled", count_call)
+    monkeypatch.setattr(FixedEnsembleRun, "run_on_compiled_engine", count_call)
     ensemble = lt.ensemble(body, START, SPAN, STEP, parameters={"a": A}, engine="compiled")
     assert calls == [1]
     assert ensemble.status.tolist() == [StatusCode.INTERRUPTED] * 3

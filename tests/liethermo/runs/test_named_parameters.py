@@ -9,6 +9,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.runs.named_parameters import named_parameters, replace_parameters
+from tests.liethermo.systems.qubits import qubit
 
 MOMENTS = np.array([3.0, 2.0, 1.0])
 START = [0.1, 0.5, 0.6]
@@ -179,3 +180,61 @@ def test_a_moment_of_zero_is_that_of_a_rod():
     np.testing.assert_array_equal(rod.energy.A, [0.0, 0.5, 0.5])
     many = lt.ensemble(system, START, SPAN, 0.1, parameters={"energy.inertia": [[0.0, 2.0, 2.0], MOMENTS]})
     np.testing.assert_allclose(many.x[1], last_state(system), rtol=1e-14)
+
+
+def _friction_system() -> lt.MetriplecticSystem:
+    return lt.MetriplecticSystem(
+        mf.Canonical(1),
+        lambda x: 0.5 * (x @ x),
+        dissipation=lt.Friction(np.array([[2.0, 1.0], [1.0, 1.0]])),
+        baths=lt.HeatBaths(np.inf, 2.0),
+    )
+
+
+def _spin_with_reservoir() -> lt.System:
+    return lt.models.single_spin(1.0, 0.5, baths=lt.HeatBaths(np.inf, 1.0))
+
+
+BODY = lt.models.tumbling_body((3.0, 2.5, 1.5), rate=0.1)
+TENSOR = np.array([[2.0, 0.2, 0.0], [0.2, 2.5, 0.0], [0.0, 0.0, 1.5]])
+
+CONDITIONS = {
+    "moments": (lambda: BODY, "energy.inertia", [3.0, -2.5, 1.5], "moments of inertia must be positive"),
+    "no rod": (lambda: BODY, "energy.inertia", [0.0, 2.5, 1.5], "moments of inertia must be positive"),
+    "tensor": (lambda: lt.models.free_rigid_body(TENSOR), "energy.inertia", TENSOR - 2.0, "positive definite"),
+    "stiffness": (lt.models.thermoelastic_chain, "energy.summands[1].stiffness", -100.0, "stiffness must be positive"),
+    "gas": (lt.models.gas_piston, "energy.summands[4].gas.moles", 0.0, "moles must be positive"),
+    "friction of a piston": (lt.models.gas_piston, "dissipation.parts[0].R", [-20.0], "friction must be >= 0"),
+    "friction of a spring": (lt.models.mass_spring_gas, "friction.R", [-0.2], "friction must be >= 0"),
+    "conductance": (lt.models.thermo_particles, "dissipation.conductance", [-1.0], "a conductance must be >= 0"),
+    "bearing": (lt.models.reaction_wheels, "dissipation.friction", [0.1, -0.1, 0.1], "friction must be >= 0"),
+    "reservoir": (_spin_with_reservoir, "baths.temperature", [-1.0], "temperature of a bath must be positive"),
+    "damping": (_friction_system, "dissipation.D", [[1.0, 2.0], [2.0, 1.0]], "must be symmetric and positive semi"),
+    "not symmetric": (_friction_system, "dissipation.D", [[1.0, 0.5], [0.0, 1.0]], "must be symmetric and positive"),
+    "jumps": (qubit, "dissipation.rates[0]", -0.1, "rate must be >= 0"),
+}
+"""Systems with a parameter, a value that its constructor refuses, and the message."""
+
+PISTON_AT_REST = [0.0, 0.5, 0.0, 0.0, 0.0]
+
+
+@pytest.mark.sampled("moments", "stiffness", "damping")
+@pytest.mark.parametrize("name", CONDITIONS)
+def test_values_by_name_meet_the_conditions_of_constructors(name):
+    build, parameter, invalid, message = CONDITIONS[name]
+    system = build()
+    valid = named_parameters(system)[parameter]
+    assert np.shape(invalid) == valid.shape
+    with pytest.raises(lt.InputError, match=message):
+        replace_parameters(system, {parameter: invalid})
+    replace_parameters(system, {parameter: valid})
+    x0 = PISTON_AT_REST if build is lt.models.gas_piston else np.asarray(system.samples(1, seed=3))[0]
+    propagator = lt.Propagator(system, None, 1e-3)
+    for call in (
+        lambda: propagator.final(x0, (0.0, 2e-3), parameters={parameter: invalid}),
+        lambda: lt.flow(system, x0, (0.0, 2e-3), 1e-3, parameters={parameter: invalid}),
+    ):
+        with pytest.raises(lt.InputError, match=message):
+            call()
+    many = lt.ensemble(system, x0, (0.0, 2e-3), 1e-3, parameters={parameter: np.array([valid, invalid])})
+    assert many.status[0] == 0 != many.status[1]

@@ -109,12 +109,12 @@ def test_random_numbers_are_those_of_the_paper():
 
 def test_random_numbers_in_portions():
     """Normal, independent, bounded; the same however they are asked for."""
-    all_increments = NOISE.consecutive_increments(3, np.arange(40), 0, 1000, 1.0)
+    all_increments = NOISE.increments_of_equal_steps(3, np.arange(40), 0, 1000, 1.0)
     assert np.array_equal(
-        NOISE.consecutive_increments(3, np.arange(10, 20), 100, 57, 1.0), all_increments[10:20, 100:157]
+        NOISE.increments_of_equal_steps(3, np.arange(10, 20), 100, 57, 1.0), all_increments[10:20, 100:157]
     )
     assert abs(
-        (2.0 * NOISE.consecutive_increments(3, np.arange(40), 0, 1000, 0.25) * all_increments).mean()
+        (2.0 * NOISE.increments_of_equal_steps(3, np.arange(40), 0, 1000, 0.25) * all_increments).mean()
     ) < 4 / np.sqrt(all_increments.size)
     sample = all_increments.ravel()
     count = len(sample)
@@ -381,7 +381,7 @@ def test_heat_of_a_bath_is_what_the_energy_changes_by():
     system = rotor()
     solution = run(system, BATH, "array")
     method, gradient = lt.MetriplecticMidpoint(), lt.Gonzalez()
-    rows = BATH.consecutive_increments(3, np.zeros(1, int), 0, 100, 0.05)[0]
+    rows = BATH.increments_of_equal_steps(3, np.zeros(1, int), 0, 100, 0.05)[0]
     noisy = BATH.method_with_noise(system, method)
 
     @jax.jit

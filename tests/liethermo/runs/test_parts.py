@@ -8,7 +8,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.runs.noise import step_code, step_time_codes
+from liethermo.runs.noise import integer_code_of_step_size, integer_codes_of_step_times
 from liethermo.runs.schedule import ScheduleSegment
 from tests.cases import BuiltOnUse
 from tests.systems import oscillator
@@ -188,10 +188,10 @@ def test_steps_at_times_that_are_rounded_otherwise_have_the_same_names(step, off
         product_times = start + n * step
         sum_times = np.cumsum(np.append(start, np.full(1999, step)))
         shifted_times = (start + 700 * step) + (n - 700) * step
-        product_cells = step_time_codes(product_times, step, step)
+        product_cells = integer_codes_of_step_times(product_times, step, step)
         for times in (sum_times, shifted_times, (first_step + offset + n) * step):
-            assert step_time_codes(times, step, step)[0] == product_cells[0]
-            assert np.array_equal(step_time_codes(times, step, step)[1], product_cells[1])
+            assert integer_codes_of_step_times(times, step, step)[0] == product_cells[0]
+            assert np.array_equal(integer_codes_of_step_times(times, step, step)[1], product_cells[1])
         assert (np.diff(product_cells[1]) == 64).all()
 
 
@@ -224,7 +224,7 @@ def test_no_two_steps_of_a_path_have_the_same_name():
     starts = -3.0 + np.append(0.0, np.cumsum(lengths)[:-1])
     names = set()
     for start, length in zip(starts, lengths, strict=True):
-        halvings, cells = step_time_codes(np.array([start]), length, 0.1)
+        halvings, cells = integer_codes_of_step_times(np.array([start]), length, 0.1)
         names.add((halvings, int(cells[0])))
     assert len(names) == len(lengths)
 
@@ -232,10 +232,14 @@ def test_no_two_steps_of_a_path_have_the_same_name():
 def test_names_of_steps_whose_sizes_are_rounded_otherwise():
     """A tenth of a span is the same step in all spans; steps that differ by more are others."""
     for i in range(1, 200):
-        assert step_code((0.1 * (i + 1) - 0.1 * i) / 10) == step_code(0.01)
+        assert integer_code_of_step_size((0.1 * (i + 1) - 0.1 * i) / 10) == integer_code_of_step_size(0.01)
     for step in (0.1, 0.5, 1.0, 1 / 3, 1e-12, 7e30):
-        assert step_code(step * (1 + 1e-12)) == step_code(step * (1 - 1e-12)) == step_code(step)
-        codes = [step_code(step * (1.0 + 1e-8 * i)) for i in range(-5, 6)]
+        assert (
+            integer_code_of_step_size(step * (1 + 1e-12))
+            == integer_code_of_step_size(step * (1 - 1e-12))
+            == integer_code_of_step_size(step)
+        )
+        codes = [integer_code_of_step_size(step * (1.0 + 1e-8 * i)) for i in range(-5, 6)]
         assert len(set(codes)) == 11
         assert codes == sorted(codes)
 

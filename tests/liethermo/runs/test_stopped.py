@@ -49,7 +49,7 @@ def test_fixed_steps(monkeypatch, error, why):
 def test_adaptive_steps(monkeypatch):
     from liethermo.runs.run import Run
 
-    append, calls = Run._save_steps, []
+    append, calls = Run._save_accepted_steps, []
 
     def fail_second_append(self, *arguments):
         calls.append(1)
@@ -57,7 +57,7 @@ def test_adaptive_steps(monkeypatch):
             raise MemoryError
         return append(self, *arguments)
 
-    monkeypatch.setattr(Run, "_save_steps", fail_second_append)
+    monkeypatch.setattr(Run, "_save_accepted_steps", fail_second_append)
     solution = lt.integrate(rigid_body(), X0, (0.0, 500.0), lt.Adaptive(1e-9))
     assert "no memory left" in solution.status.message
     assert 1 < len(solution.t) == len(solution.x) == len(solution.energy)

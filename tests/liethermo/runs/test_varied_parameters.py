@@ -52,8 +52,12 @@ def test_values_of_another_symmetry_in_any_order(method):
 
 
 def test_control_a_program_that_is_chosen_by_the_first_values_is_wrong(monkeypatch):
-    program_key = VariedParameters.program_key
-    monkeypatch.setattr(VariedParameters, "program_key", lambda varied, values: program_key(varied, values) and b"one")
+    set_values_and_get_program_key = VariedParameters.set_values_and_get_program_key
+    monkeypatch.setattr(
+        VariedParameters,
+        "set_values_and_get_program_key",
+        lambda varied, values: set_values_and_get_program_key(varied, values) and b"one",
+    )
     propagator, method = lt.Propagator(body(), METHODS[0], STEP), METHODS[0]
     propagator.final(MU, SPAN, parameters={"energy.A": [1.0, 1.0, 1.0]})
     final = propagator.final(MU, SPAN, parameters={"energy.A": [1.0, 0.5, 2.0]})

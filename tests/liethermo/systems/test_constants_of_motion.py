@@ -8,11 +8,11 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.systems.invariants import (
-    conserves,
-    preserved_names,
+    are_conserved,
+    preserved_function_names,
     recorded_functions_with_verdicts,
     resolve_invariants_near,
-    undecided_functions,
+    undecided_function_names,
 )
 
 EPS = np.finfo(float).eps
@@ -43,7 +43,7 @@ def test_what_is_declared_is_held_where_nothing_can_be_evaluated():
     system = system_in_ball()
     assert not np.isfinite(log_inside_ball(jnp.asarray(system.samples(8)[0])))
     assert system.first_integrals() == {"total"}
-    assert conserves(system, (lt.Function(total), lt.Function(lambda x: x[0] ** 2))) == [True, None]
+    assert are_conserved(system, (lt.Function(total), lt.Function(lambda x: x[0] ** 2))) == [True, None]
     run = lt.integrate(system, [3.5, 2.7, 3.2], (0.0, 10.0), 0.1, lt.MetriplecticRungeKutta(4))
     assert np.abs(run.casimirs["total"] - 9.4).max() <= 64 * EPS
 
@@ -51,7 +51,7 @@ def test_what_is_declared_is_held_where_nothing_can_be_evaluated():
 def test_what_cannot_be_evaluated_is_found_out_near_states_that_are_given():
     system, x0 = system_in_ball(), np.array([3.5, 2.7, 3.2])
     square = lt.Function(lambda x: x[0] ** 2)
-    assert conserves(system, (lt.Function(total), square), near=x0) == [True, False]
+    assert are_conserved(system, (lt.Function(total), square), near_states=x0) == [True, False]
 
 
 class Half(lt.Dissipation):
@@ -65,7 +65,7 @@ def test_unknown_is_a_row_of_its_own():
     """The Casimir is neither conserved nor not: the start is on the edge, where the entropy has no derivative."""
     system = lt.LiePoissonSystem(mf.so(3), lambda m: 0.5 * m[2], lambda m: jnp.log(m[0] - 1e6), Half(), validate=False)
     (name,) = system.casimirs()
-    assert undecided_functions(system) == {name}
+    assert undecided_function_names(system) == {name}
     assert recorded_functions_with_verdicts(system)[name][1] is None
     assert resolve_invariants_near(system, np.array([2e6, 1.0, 1.0])).first_integrals() == {name}
 
@@ -73,7 +73,7 @@ def test_unknown_is_a_row_of_its_own():
 def test_it_is_known_without_random_points_after_a_pytree_is_taken_apart():
     system = system_in_ball()
     again = jax.tree_util.tree_unflatten(*reversed(jax.tree_util.tree_flatten(system)))
-    assert preserved_names(again) == preserved_names(system)
+    assert preserved_function_names(again) == preserved_function_names(system)
     assert again.first_integrals() == system.first_integrals()
 
 
@@ -85,7 +85,7 @@ def test_two_dissipations_that_preserve_one_quantity_give_it_one_name(scale):
     first, second = (lambda x: x[0] + x[1]), (lambda x: scale * (x[1] + x[0]))
     friction = lt.ProjectedMetric(preserve=(first,), rate=0.1) + lt.ProjectedMetric(preserve=(second,), rate=0.2)
     system = lt.MetriplecticSystem(None, lambda x: x[2] ** 2, lambda x: -x @ x, friction, dim=3)
-    assert preserved_names(system) == ("preserved 1", "preserved 1")
+    assert preserved_function_names(system) == ("preserved 1", "preserved 1")
     assert list(system.functions()) == ["preserved 1"]
 
 
@@ -99,18 +99,18 @@ def test_a_casimir_or_a_momentum_map_gives_its_name():
     named = lt.LiePoissonSystem(
         mf.u(3), system.energy, lambda x: -x @ x, lt.ProjectedMetric(preserve=trace), validate=False
     )
-    assert preserved_names(named) == ("mu9",)
+    assert preserved_function_names(named) == ("mu9",)
     friction = lt.ProjectedMetric(preserve=(lambda x: x[0] + x[1], total))
     energy, maps = (lambda x: x[2] ** 2), {"J": lambda x: 5.0 * (x[0] + x[1])}
     own = lt.MetriplecticSystem(None, energy, lambda x: -x @ x, friction, dim=4, momentum_maps=maps, validate=False)
-    assert preserved_names(own) == ("J", "total")
+    assert preserved_function_names(own) == ("J", "total")
     assert list(own.functions()) == ["J", "total"]
 
 
 def test_other_functions_keep_names_of_their_own():
     friction = lt.ProjectedMetric(preserve=(lambda x: x[0], lambda x: x[0] ** 2 + x[1]))
     system = lt.MetriplecticSystem(None, lambda x: x[2] ** 2, lambda x: -x @ x, friction, dim=4, validate=False)
-    assert preserved_names(system) == ("preserved 1", "preserved 2")
+    assert preserved_function_names(system) == ("preserved 1", "preserved 2")
 
 
 # -- what the Gauss methods hold --------------------------------------------------------------------------------------

@@ -196,15 +196,15 @@ def test_inverses(widest, monkeypatch):
     rng = np.random.default_rng(0)
     A = scipy.sparse.csc_array(scipy.sparse.eye_array(50) + 3.0 * grid_laplacian((5, 10)))
     x = rng.standard_normal(50)
-    assert np.abs(sparse_engine.SparseInverse(A, 5)(A @ x) - x).max() < (1e-13 if widest else 1e-4)
+    assert np.abs(sparse_engine.SparseLinearSolver(A, 5)(A @ x) - x).max() < (1e-13 if widest else 1e-4)
     bad = A.copy()
     bad.data[3] = np.nan
     with pytest.raises(np.linalg.LinAlgError, match="not finite"):
-        sparse_engine.SparseInverse(bad, 5)
+        sparse_engine.SparseLinearSolver(bad, 5)
 
 
 test_a_singular_matrix = refusal_test(
-    (lambda: sparse_engine.SparseInverse(scipy.sparse.csc_array(np.diag([1.0, 0.0])), 1), "singular"),
+    (lambda: sparse_engine.SparseLinearSolver(scipy.sparse.csc_array(np.diag([1.0, 0.0])), 1), "singular"),
     error=np.linalg.LinAlgError,
 )
 

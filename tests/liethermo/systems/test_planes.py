@@ -259,7 +259,11 @@ def test_control_a_wrong_order_is_seen():
     system = ring()
     found_values = reorder_spins(system)
     first = initial_run_state_program(system, lt.MetriplecticMidpoint(), jnp.asarray(system.state(unit(N_LARGE))))
-    right = array_engine.advance(system, lt.MetriplecticMidpoint(), first, *map(jnp.asarray, (0.05, 1, 1)), 1)[0]
+    right = array_engine.take_steps_and_save(
+        system, lt.MetriplecticMidpoint(), first, *map(jnp.asarray, (0.05, 1, 1)), 1
+    )[0]
     wrong = first._replace(x=found_values.reorder_state(first.x))
-    other = array_engine.advance(system, lt.MetriplecticMidpoint(), wrong, *map(jnp.asarray, (0.05, 1, 1)), 1)[0]
+    other = array_engine.take_steps_and_save(
+        system, lt.MetriplecticMidpoint(), wrong, *map(jnp.asarray, (0.05, 1, 1)), 1
+    )[0]
     assert np.abs(right.x - found_values.restore_state(other.x)).max() > 1e-3

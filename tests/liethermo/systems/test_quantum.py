@@ -327,7 +327,10 @@ def test_a_hamiltonian_in_terms_is_the_function_that_they_make():
     assert np.abs(ends[0].x - ends[1].x).max() <= 1e-14
     assert np.abs(ends[0].energy - ends[1].energy).max() <= 1e-14
     assert not lt.QuantumSystem([H0, H1]).is_driven
-    assert np.array_equal(lt.QuantumSystem([H0, H1]).hamiltonians()[0], lt.QuantumSystem(H0 + H1).hamiltonians()[0])
+    assert np.array_equal(
+        lt.QuantumSystem([H0, H1]).hamiltonians_at_test_times()[0],
+        lt.QuantumSystem(H0 + H1).hamiltonians_at_test_times()[0],
+    )
     assert not lt.QuantumSystem([[0.0, 1.0], [1.0, 0.0]]).is_driven
 
     def driven(amplitude):

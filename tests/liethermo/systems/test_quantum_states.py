@@ -1,5 +1,7 @@
 """States of quantum systems: pure ones, eigenvalues at zero, ensembles, and constants added to the energy."""
 
+import re
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -246,6 +248,23 @@ def test_a_step_that_leaves_the_cone_ends_the_run_and_a_shorter_one_stays_inside
     assert np.abs(q.density(shorter.x[-1]) - exact).max() <= 1e-3
 
 
+@pytest.mark.parametrize("coherence", [0.0, 0.1])
+def test_the_advice_on_a_step_of_millions_of_relaxation_times(coherence):
+    """With a constant rate, the jumps down have ``rate * exp(omega / 2T)``, here 1.5e8; no step of 0.03 resolves it."""
+    lower = np.diag([1.0], 1)
+    q = lt.QuantumSystem(np.diag([0.0, 4.0]), lt.ThermalJumps([(lower, 0.3)]), infinite(0.1))
+    rho, method = np.array([[0.53, coherence], [coherence, 0.47]]), lt.MetriplecticGauss(2)
+    run = lt.integrate(q, q.state(rho), (0.0, 3.0), 0.03, method, on_failure="return")
+    assert not run.status.ok
+    step = float(re.search(r"Try a smaller step, for example ([\d.e-]+)", run.status.message)[1])
+    shorter = lt.integrate(q, q.state(rho), (0.0, 100.0 * step), step, method)
+    jumps = [(lower, 0.3 * np.exp(20.0)), (lower.T, 0.3 * np.exp(-20.0))]
+    generator = np.stack([lindblad(E, np.diag([0.0, 4.0]), jumps).ravel() for E in np.eye(4).reshape(-1, 2, 2)], axis=1)
+    exact = (scipy.linalg.expm(shorter.t[-1] * generator) @ rho.ravel()).reshape(2, 2)
+    assert np.abs(q.density(shorter.x[-1]) - exact).max() <= 1e-4
+    assert shorter.audit().passed
+
+
 STIFF = {
     "2 levels": ((4.0,), lt.MetriplecticGauss(2), 0.03, 2.0),
     "3 levels": ((1.0, 4.0), lt.MetriplecticGauss(2), 0.015, 1.5),
@@ -443,7 +462,7 @@ class HasFull:
 def test_operators_of_other_libraries_are_read_by_their_matrices():
     q = lt.QuantumSystem([HasFull(QUBIT), (HasFull(X), jnp.cos)], lt.ThermalJumps([(HasFull(Z), 0.1)]))
     assert q.is_driven
-    assert np.abs(lt.QuantumSystem(HasFull(QUBIT)).hamiltonians()[0] - QUBIT).max() <= 1e-15
+    assert np.abs(lt.QuantumSystem(HasFull(QUBIT)).hamiltonians_at_test_times()[0] - QUBIT).max() <= 1e-15
 
 
 BAD = {

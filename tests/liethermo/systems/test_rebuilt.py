@@ -8,7 +8,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.systems.invariants import conserves, preserved_names
+from liethermo.systems.invariants import are_conserved, preserved_function_names
 from liethermo.testing.suites import copy_pytree
 from liethermo.tracing.interpret import evaluate_at_points
 from tests.cases import DISSIPATIONS, build
@@ -64,10 +64,10 @@ def test_a_sum_keeps_what_every_part_is_told_to_preserve():
     """Also where both parts are told so, and after the sum is taken apart."""
     system = copy_pytree(SYSTEMS["sum of frictions"]())
     length = lambda x: jnp.dot(x[3:], x[3:])  # noqa: E731
-    assert conserves(system, (lt.Function(length),)) == [True]
+    assert are_conserved(system, (lt.Function(length),)) == [True]
     assert {"mu4**2 + mu5**2 + mu6**2"} == system.first_integrals()  # one quantity, one name
-    assert len(system.preserved) == 2
-    assert preserved_names(system) == ("mu4**2 + mu5**2 + mu6**2",) * 2
+    assert len(system.preserved_functions) == 2
+    assert preserved_function_names(system) == ("mu4**2 + mu5**2 + mu6**2",) * 2
 
 
 @pytest.mark.slow

@@ -378,7 +378,7 @@ def test_double_brackets_on_a_lattice_lower_the_energy_to_the_last_bit_of_the_le
 
 def test_control_a_correction_that_is_not_local_leaves_the_spheres(monkeypatch):
     system = small_lattice()
-    monkeypatch.setattr(lt.SpinSystem, "surface", None)
+    monkeypatch.setattr(lt.SpinSystem, "constraint_surface", None)
     solution = lt.integrate(
         system, system.state(unit(3)), (0.0, 5.0), 0.25, lt.MetriplecticRungeKutta(6), engine="compiled"
     )
@@ -435,15 +435,15 @@ def test_ratios_and_sites_of_the_structure_are_checked():
 class IteratedRotation(lt.SpinSystem):
     """Control: what turns the spins is left to the iteration."""
 
-    def solve_at_spins(self, *arguments):
+    def solve_slopes_at_each_spin(self, *arguments):
         return None
 
 
 class NoiseAlone(lt.SpinSystem):
     """Control: only the turn by noise is solved for at once."""
 
-    def solve_at_spins(self, x, dH, dS, noise_rates, others, half_step, k):
-        slopes = super().solve_at_spins(x, dH, dS, noise_rates, others, 0.0, k)
+    def solve_slopes_at_each_spin(self, x, dH, dS, noise_rates, others, half_step, k):
+        slopes = super().solve_slopes_at_each_spin(x, dH, dS, noise_rates, others, 0.0, k)
         matrices = jnp.eye(3) - jnp.stack([jnp.cross(half_step * noise_rates, e) for e in np.eye(3)], axis=-1)
         residuals = (slopes - k)[:-1].reshape(-1, 3, 1)
         return jnp.append(k[:-1] + jnp.linalg.solve(matrices, residuals).ravel(), slopes[-1])
@@ -516,7 +516,7 @@ def test_equations_of_each_spin_have_the_derivative_of_its_velocity():
     s, v, w = unit(1).ravel(), *RANDOM.standard_normal((2, 3))
     dH, h = np.array([-0.3, -0.5, -1.0]), 0.2
     slopes, k = (
-        spin.solve_at_spins(s, dH, np.zeros(3), w[None], np.zeros(3), h, v),
+        spin.solve_slopes_at_each_spin(s, dH, np.zeros(3), w[None], np.zeros(3), h, v),
         spin.vector_field(s) + np.cross(w, s),
     )
     u = np.asarray(slopes) - v

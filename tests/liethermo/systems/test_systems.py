@@ -17,6 +17,7 @@ import manifolds as mf
 from liethermo.integrators import registered_methods
 from liethermo.systems import Domain
 from liethermo.systems.check import MAX_FULL_JACOBI_DIM
+from liethermo.systems.interface import REPLACED_MEMBERS
 from tests.cases import energy_of, state_of
 
 SPHERE = lt.Quadratic(np.ones(3))
@@ -340,6 +341,18 @@ def test_members_that_are_not_called_any_more_are_refused():
         type("Earlier", (lt.MetriplecticSystem,), {"outside": lambda self, x: "too hot"})
     kind = type("Kind", (lt.MetriplecticSystem,), {"domain": Domain(why_outside=lambda x: "too hot")})
     assert kind(None, lambda x: x[0] ** 2, dim=1).domain.why_outside(jnp.ones(1)) == "too hot"
+
+
+def test_members_that_were_renamed_are_refused_under_their_old_names():
+    """An override of the old name would have no effect; ``preserved``, which methods of users call, still works."""
+    for name, replacement in REPLACED_MEMBERS.items():
+        assert hasattr(lt.MetriplecticSystem, replacement)
+        with pytest.raises(TypeError, match=rf"defines {name}, which nothing calls\. Override {replacement}"):
+            type("Earlier", (lt.MetriplecticSystem,), {name: None})
+    friction = lt.ProjectedMetric(preserve=(lambda x: x[0],), rate=0.1)
+    system = lt.LiePoissonSystem(mf.so(3), lt.Quadratic([1.0, 2.0, 3.0]), SPHERE, friction, validate=False)
+    (preserved,) = system.preserved
+    assert preserved is system.preserved_functions[0]
 
 
 def test_what_a_system_says_of_first_states_is_heard_through_what_it_is_run_as():

@@ -556,6 +556,11 @@ def test_a_defect_of_one_matrix_is_applied_to_each(defect):
     assert group == mf.MatrixGroup("mine", mf.sl(2), defect)
 
 
+def test_a_defect_with_an_index_out_of_range_is_refused():
+    with pytest.raises(IndexError, match="defect of the group mine has the index 2 of an axis with 2 entries"):
+        mf.MatrixGroup("mine", mf.sl(2), lambda g: jnp.abs(g[1, 1] * g[2, 2] - 1.0))
+
+
 @pytest.mark.parametrize(
     ("defect", "fault"), [(lambda g: float(g[0, 0]), "an error"), (lambda g: g - 1.0, r"an array of shape \(2, 2\)")]
 )

@@ -127,7 +127,7 @@ def test_a_run_from_the_centre_of_a_potential_of_the_distance(method, max_differ
 
 def hyperbolic_point(r, angle):
     space = np.sinh(r) * np.array([np.cos(angle), np.sin(angle)])
-    return np.concatenate([[np.sqrt(1.0 + space @ space)], space])
+    return np.concatenate([[np.hypot(1.0, np.hypot(*space))], space])
 
 
 def exact_hyperbolic_distance(x, y) -> float:
@@ -181,6 +181,24 @@ def test_hyperbolic_points_on_one_ray_at_any_radius(n):
     assert np.asarray(space.distance(x, opposite)) == pytest.approx(2 * r + d, rel=1e-14)
     x, y = (np.array([np.cosh(r), *(np.sinh(r) * u)]) for r, u in ((200.0, np.eye(n)[0]), (203.0, np.eye(n)[1])))
     assert float(space.distance(x, y)) == pytest.approx(403.0 - np.log(2.0), rel=1e-14)  # a right angle between them
+
+
+def test_hyperbolic_points_beyond_the_range_of_squares():
+    """Up to radius 354 all maps work; farther points are refused with their distance from the apex and the limit."""
+    space, apex = mf.Hyperbolic(2), np.array([1.0, 0.0, 0.0])
+    x = hyperbolic_point(353.9, 0.0)
+    assert float(space.distance(apex, x)) == pytest.approx(353.9, rel=1e-15)
+    assert float(space.distance(x, x * [1.0, -1.0, 1.0])) == pytest.approx(707.8, rel=1e-15)
+    assert np.asarray(space.exp(apex, [0.0, 353.9, 0.0])) == pytest.approx(x, rel=1e-12)
+    for r in (354.1, 356.0, 500.0, 709.0):
+        y, message = hyperbolic_point(r, 0.0), rf"is {r:g} from the apex or farther.*Use points within 354"
+        for call in (lambda y=y: space.point(y), lambda y=y: space.log(apex, y)):
+            with pytest.raises(mf.DomainError, match=message):
+                call()
+    with pytest.raises(mf.DomainError, match=r"cannot be projected: it is 500.* from the apex"):
+        space.project(hyperbolic_point(500.0, 0.0))
+    with pytest.raises(mf.DomainError, match=r"exp\(x, v\) exceeds the range of double precision"):
+        space.exp(apex, [0.0, 400.0, 0.0])
 
 
 def test_hyperbolic_derivatives_far_out():

@@ -91,6 +91,23 @@ def test_what_follows_from_a_projection(space):
         space.norm(x, normal)
 
 
+class CountedFromOne(mf.Space):
+    """A sphere whose author counts components from one."""
+
+    name, dim, shape = "a sphere counted from one", 2, (3,)
+
+    def _project(self, x):
+        return x / jnp.sqrt(x[..., 1] ** 2 + x[..., 2] ** 2 + x[..., 3] ** 2)[..., None]
+
+    def _project_tangent(self, x, w):
+        return w - (x * w).sum(axis=-1, keepdims=True) * x
+
+
+def test_an_index_out_of_range_in_a_space_of_ones_own():
+    with pytest.raises(IndexError, match="_project of a sphere counted from one has the index 3 of an axis with 3"):
+        CountedFromOne().point([1.0, 2.0, 2.0], project=True)
+
+
 def test_a_space_without_geodesics():
     space = Ellipsoid((1.0, 2.0))
     x = space.random(0)
@@ -226,7 +243,10 @@ def test_a_run_on_a_torus():
         (lambda: mf.LevelSet(lambda x: jnp.sum(x**2) + 1.0, 3), mf.SpaceError, "no point of it from 16 random arrays"),
         (lambda: mf.LevelSet(lambda x: square(x) ** 2, 3), mf.SpaceError, "gradient of constraint 0 vanishes.*near"),
         (lambda: mf.LevelSet(lambda x: x, 3), mf.SpaceError, "3 constraints on 3 numbers leave no manifold"),
-        (lambda: mf.LevelSet(lambda x: x @ np.ones(5), 3), mf.SpaceError, r"take no array of shape \(3,\)"),
+        (lambda: mf.LevelSet(lambda x: x @ np.ones(5), 3), mf.SpaceError, r"must take an array of shape \(3,\)"),
+        (lambda: mf.LevelSet(lambda x: x[1] ** 2 + x[3] ** 2 - 1.0, 3), mf.SpaceError, "index 3 of an axis with 3 ent"),
+        (lambda: mf.LevelSet([square, lambda x: x[-5]], 4), mf.SpaceError, "constraint 1 has the index -5 of an axis"),
+        (lambda: mf.LevelSet(square, 3, metric=lambda x: x[4] * jnp.eye(3)), mf.SpaceError, "metric has the index 4"),
         (lambda: mf.LevelSet(square, 3, metric=np.eye(2)), mf.ParameterError, r"shape \(3, 3\)"),
         (lambda: mf.LevelSet(square, 3, metric=-np.eye(3)), mf.ParameterError, "eigenvalue -1"),
         (lambda: mf.LevelSet(square, 3).point([1.0, 1.0, 0.0]), mf.OffManifoldError, r"residual 0\.\d+, tolerance"),

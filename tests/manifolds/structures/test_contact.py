@@ -391,3 +391,8 @@ def test_unusable_structures():
         mf.ContactForm(lambda x: x[:2], 5)
     with pytest.raises(mf.ShapeError, match="last axis 3"):
         mf.CanonicalContact(1).evolution_vector_field(lambda x: x[0])([1.0, 2.0])
+
+
+def test_a_form_with_an_index_out_of_range_is_refused():
+    with pytest.raises(IndexError, match="a contact form has the index 3 of an axis with 3 entries"):
+        mf.ContactForm(lambda x: jnp.array([-x[3], 0.0, 1.0]), 3)
