@@ -48,6 +48,7 @@ def test_a_study_from_a_spec_file_its_status_and_its_picture(folder):
     dataset = lt.load_study("body.zarr")
     assert dict(dataset.sizes)["inertia[0]"] == 3
     assert dataset.rate.units == "1/s"
+    np.testing.assert_allclose(dataset.rate, np.geomspace(0.1, 2.0, 4), rtol=1e-15)
     final_state = lt.integrate(lt.models.rigid_body((2.4, 1.5, 1.0), 2.0), [0.1, 1.0, 0.1], (0.0, 4.0), 0.1).x[-1]
     np.testing.assert_allclose(dataset.final[3, 2], final_state, rtol=0, atol=1e-14)
     assert dataset.attrs["spec"]["study"]["chunk"] == 4

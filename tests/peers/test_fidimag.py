@@ -144,6 +144,7 @@ def test_time_zeeman():
 # -- tests/test_llg.py, test_llg_atomistic.py -------------------------------------------------------------------------
 
 
+@pytest.mark.sampled("test_sim_10_spins")
 @pytest.mark.parametrize("sites", [1, (10, 5)], ids=["test_sim_single_spin", "test_sim_10_spins"])
 def test_sim_single_spin(sites):
     """Gilbert's damping 0.1 in a field of 1e5 A/m for a nanosecond: fidimag asks for 5e-7."""

@@ -52,7 +52,6 @@ def test_the_default_is_the_orthogonal_projector():
     assert np.allclose(system.vector_field(x) - motion, P @ (0.7 * np.abs(f) * f), atol=1e-14)
 
 
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("psi", "slope"),
     [

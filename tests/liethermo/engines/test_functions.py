@@ -100,7 +100,7 @@ def body(function, dissipation=True):
     )
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled("cond-MetriplecticRungeKutta(order=4)")
 @pytest.mark.parametrize(
     ("name", "method"),
     [pytest.param(name, METHODS[i % 2], id=f"{name}-{METHODS[i % 2]}") for i, name in enumerate(FUNCTIONS)],

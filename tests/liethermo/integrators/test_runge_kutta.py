@@ -95,6 +95,7 @@ def test_error_estimates_are_right_for_a_linear_equation_and_a_quadrature(order)
         assert 0.3 < size / error < (30.0 if d is estimate.weights and slopes is quadrature else 3.0)
 
 
+@pytest.mark.sampled("4")
 @pytest.mark.parametrize("order", ORDERS)
 def test_the_estimate_is_right_for_a_linear_oscillation(order):
     """The error of a step of a rotation is along the circle, where no correction changes it."""

@@ -59,6 +59,7 @@ def test_waves_along_a_field_are_those_of_alfven():
     np.testing.assert_allclose(coefficients[1], 1j * m * b * (eigenvalue - 2) * wave, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_midpoints_keep_what_is_quadratic():
     """Energy, cross helicity and the square of the potential are conserved; cubic Casimirs are a control."""
     q = QuantisedSphere(6)

@@ -53,7 +53,7 @@ def test_a_nutation_damper_against_velocities(ring):
     assert np.allclose(run.provenance["inertia"], np.diag(INERTIA), rtol=0, atol=1e-14)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled("dual spin-MetriplecticMidpoint(gradient=Gonzalez)")
 @pytest.mark.parametrize(
     "method",
     [

@@ -215,6 +215,7 @@ def test_nan_midway_keeps_what_was_computed():
     assert solution.x[-1, 0] < 1.1
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("every", [1, 7, 10_000])
 def test_on_failure_return(every):
     solution = lt.integrate(domain_system(), X0, (0.0, 500.0), 0.1, save_every=every, on_failure="return")

@@ -23,6 +23,7 @@ def pair(request):
     return mf.magnetic_extension(g, by_brackets=True), mf.magnetic_extension(g, by_brackets=False)
 
 
+@pytest.mark.sampled(2)
 def test_operations_and_forms_are_those_of_the_constants(pair):
     m, c = pair
     x, y, mu = np.random.default_rng(0).standard_normal((3, 4, c.dim))

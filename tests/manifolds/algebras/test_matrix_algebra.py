@@ -26,6 +26,7 @@ def pair(request):
     return matrix_algebra, constants_algebra
 
 
+@pytest.mark.sampled(1)
 def test_operations_and_forms_are_those_of_the_constants(pair):
     m, c = pair
     x, y, mu = np.random.default_rng(0).standard_normal((3, 4, c.dim))
@@ -45,6 +46,7 @@ def test_operations_and_forms_are_those_of_the_constants(pair):
     np.testing.assert_allclose(m.from_dual_matrix(M), mu, atol=1e-14)
 
 
+@pytest.mark.sampled(1)
 def test_structure_is_that_of_the_constants(pair):
     m, c = pair
     for question in (

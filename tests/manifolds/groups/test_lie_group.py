@@ -222,6 +222,7 @@ def test_exp_and_log_equal_scipy(G):
     assert is_close(G.algebra.hat(G.log(g)), logarithms, "reference")
 
 
+@pytest.mark.sampled(3)
 def test_elements_of_a_batch_do_not_meet(G):
     x, mu = elements(G, 5), duals(G, 5)
     g = G.exp(x)

@@ -93,6 +93,7 @@ def test_stages_on_a_leaf(P):
     assert np.abs(P.stages_on_leaf(x, alpha, 1e-6 * A) - (x + 1e-6 * A @ slopes)).max() <= 1e-10
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("P", LEAVES, ids=lambda P: f"{type(P).__name__}-{P.dim}")
 def test_a_covector_that_carries_a_state(P):
     """The rate is that of the motion, at a covector that is not small; the control uses the covector itself as the
