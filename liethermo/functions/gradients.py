@@ -481,7 +481,7 @@ def _clipped_ratio(numerator, denominator):
 
 
 def _safe_divide(numerator, denominator):
-    """Return a quotient, 0 where the denominator is 0 or subnormal, with finite derivatives."""
+    """Return a quotient with finite derivatives; 0 where the denominator is less than ``_TINY``."""
     is_usable = jnp.abs(denominator) > _TINY
     return jnp.where(is_usable, numerator / jnp.where(is_usable, denominator, 1.0), 0.0)
 
@@ -495,5 +495,5 @@ def _gauss_rule(n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
 _GAUSS_NODES_3 = _gauss_rule(3)[0]
 """Nodes of the Gauss rule with three nodes on [0, 1]."""
 
-_TINY = 1e-290
-"""Smallest modulus of a divisor."""
+_TINY = 1e-150
+"""Smallest modulus of a divisor: the derivative of a quotient divides by its square, which underflows below 1e-308."""

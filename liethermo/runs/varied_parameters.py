@@ -99,11 +99,8 @@ class VariedParameters:
         conservation is inconclusive.
         """
         for (parameter, slots), value in zip(self._slots, parameter_values, strict=True):
-            try:
-                array = np.asarray(value, dtype=np.float64)
-            except (TypeError, ValueError):  # which a new propagator reports
-                return None
-            if array.shape != parameter.value.shape:
+            array = np.asarray(value)
+            if array.dtype.kind not in "fiub" or array.shape != parameter.value.shape:  # which a new propagator reports
                 return None
             if parameter.condition is not None and not parameter.condition.holds(array):
                 return None

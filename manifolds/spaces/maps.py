@@ -362,7 +362,8 @@ def _call_method(space: SpaceMaps, method_name: str, static: tuple, *arrays) -> 
     method = getattr(space, method_name)
     if type(space).__module__.partition(".")[0] not in ("manifolds", "liethermo"):  # a space of the user's own
         check_indices(
-            jax.make_jaxpr(lambda *arrays: method(*arrays, *static))(*arrays), f"{method_name} of {space.name}"
+            jax.make_jaxpr(lambda *arrays: method(*arrays, *static))(*arrays),
+            f"{method_name} of {type(space).__name__}",
         )
     return method(*arrays, *static)
 

@@ -111,7 +111,7 @@ def test_a_fault_where_a_run_has_a_pace(options, monkeypatch, fresh_programs):
 def test_a_fault_in_newtons_method(monkeypatch, fresh_programs):
     """A fault while Newton's method is compiled, at the first step that needs it: the array engine resumes the run."""
     system = lt.LiePoissonSystem(mf.so(3), sine)
-    monkeypatch.setattr("liethermo.engines.compiled.step_loop.compile_newton_solver", raising)
+    monkeypatch.setattr("liethermo.engines.compiled.step_loop.write_newton_solver", raising)
     with pytest.warns(CompiledEngineWarning, match="nobody has seen this yet"):
         solution = lt.integrate(system, 3.0 * X0, (0.0, 4.0), 0.4, lt.MetriplecticMidpoint())
     assert solution.stats.newton_iterations > 0

@@ -182,7 +182,7 @@ EQUILIBRIA = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.sampled("MetriplecticRungeKutta(order=4)-a body about its axis")
 @pytest.mark.parametrize(("method", "name"), methods_with(EQUILIBRIA))
 def test_at_equilibria(method, name):
     """The Jacobian is that of differences, and the exponential of the field's to the order of the method.

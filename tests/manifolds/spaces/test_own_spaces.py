@@ -104,7 +104,7 @@ class CountedFromOne(mf.Space):
 
 
 def test_an_index_out_of_range_in_a_space_of_ones_own():
-    with pytest.raises(IndexError, match="_project of a sphere counted from one has the index 3 of an axis with 3"):
+    with pytest.raises(IndexError, match="_project of CountedFromOne has the index 3 of an axis with 3"):
         CountedFromOne().point([1.0, 2.0, 2.0], project=True)
 
 
