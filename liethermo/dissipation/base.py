@@ -75,7 +75,7 @@ class Dissipation(Module):
         return self.couplings(system)
 
     def couplings(self, system: Geometry) -> scipy.sparse.csr_array | None:
-        """Return None; a subclass may define :meth:`force_pattern` by this name, which it had in 0.2."""
+        """Return None. In 0.2 :meth:`force_pattern` had this name, and a subclass may still override it."""
         return None
 
     @property

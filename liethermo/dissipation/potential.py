@@ -15,7 +15,7 @@ from manifolds.matrices.exponential import hyperbolic_stumpff
 from ..errors import FunctionError, InputError
 from ..functions.conditions import checked_numbers, positive_condition
 from ..functions.time_span import required_argument_count
-from ..tracing.index_check import checked_result_shapes
+from ..tracing.index_check import check_indices_and_return_shapes
 from .base import Dissipation
 from .checks import RATE_CONDITION, state_shape_dtype
 from .factor import Factor
@@ -84,7 +84,7 @@ class DissipationPotential(Dissipation):
 
     def bind_to(self, system):
         bound_potential = eqx.tree_at(lambda d: d.of, self, self.of.bind_to(system))
-        shape = checked_result_shapes(
+        shape = check_indices_and_return_shapes(
             lambda x: bound_potential.psi_at_state(x)(
                 jnp.zeros(bound_potential._inner_factor_at_state(system, x).size)
             ),

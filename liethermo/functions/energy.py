@@ -682,7 +682,7 @@ class Sum(Energy):
 
 
 def function_name(energy: Energy) -> str:
-    """Return the name of the plain function of an energy; "" if there is none."""
+    """Return the name of the Python function that an energy was made from; "" if there is none."""
     return callable_name(energy.function, "") if isinstance(energy, Function | TimeDependent) else ""
 
 

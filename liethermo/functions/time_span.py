@@ -93,7 +93,7 @@ def _clip_jvp(primals, tangents):
 
 
 def set_time_span(tree, start: float, end: float, *breaks: float):
-    """Return a pytree, such as a system, whose functions of time are evaluated within a span only.
+    """Return a pytree, such as a system, whose functions of time get times that are clipped to a span.
 
     Parameters
     ----------

@@ -258,7 +258,7 @@ class TransportingMethod(OneStepMethod):
         """
 
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
-        """Return the velocities at the stages, shape (stages, n): :meth:`.System.transport_covector` at
+        """Return the velocities at the stages, shape (stages, n): :meth:`.System.driving_covector` at
         the gradients of the step.
 
         An explicit method has none: an attitude follows its steps by angles of their own.

@@ -108,7 +108,7 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
         z, dH, dS, dL = self.method.midpoint_and_gradients(system, x, compensation, h, k)
         factors_and_inputs = self._factors_and_drift_plus_noise(system, z, dH, dL, h)
         return sum(
-            (B.velocity(w) for B, w in factors_and_inputs if B.velocity), start=system.transport_covector(z, dH, dS, dL)
+            (B.velocity(w) for B, w in factors_and_inputs if B.velocity), start=system.driving_covector(z, dH, dS, dL)
         )[None]
 
     def can_transport_attitude(self, system: System) -> bool:

@@ -235,7 +235,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         names = tuple(number_preserved_functions(system))
 
         def velocity(u, dH, dS, gradients_by_name):
-            return system.transport_covector(u, dH, dS, tuple(gradients_by_name[name].discrete for name in names))
+            return system.driving_covector(u, dH, dS, tuple(gradients_by_name[name].discrete for name in names))
 
         return jax.vmap(velocity)(*self._stages_and_gradients(system, x, compensation, h, k))
 

@@ -77,7 +77,7 @@ class WithAttitude(MethodWrapper):
             raise InputError(f"reconstruction must be {', '.join(map(repr, RECONSTRUCTIONS))}, got {self.kind!r}")
 
     @property
-    def _transporting_method(self) -> TransportingMethod:
+    def _checked_inner_method(self) -> TransportingMethod:
         """The inner method; InputError if it does not give the velocities with which it moves a body."""
         if isinstance(self.method, TransportingMethod):
             return self.method
@@ -87,7 +87,7 @@ class WithAttitude(MethodWrapper):
         if name not in (SPATIAL_MOMENTUM, MOMENTUM_LESS_IMPULSE):
             return self.method.preserves_function(system.body, name)
         follows = self.kind == "coadjoint" or (self.kind == "cayley" and system.group.cayley_is_adjoint())
-        return (self.explicit or follows) and self._transporting_method.can_transport_attitude(system.body)
+        return (self.explicit or follows) and self._checked_inner_method.can_transport_attitude(system.body)
 
     def check(self, system) -> None:
         self.method.check(system.body.bind_attitude(system.group.identity))
@@ -159,7 +159,7 @@ class WithAttitude(MethodWrapper):
             return self._apply_explicit_step(system, x, compensation, new_mu, new_mu_compensation, h, k)
         xi = (
             h
-            * self._transporting_method.stage_velocities(system.body, mu, mu_compensation, h, k)[:, : system.group.dim]
+            * self._checked_inner_method.stage_velocities(system.body, mu, mu_compensation, h, k)[:, : system.group.dim]
         )
         p, p_compensation = (
             self._next_spatial_momentum(system, x, compensation, h, k, xi) if system.impulse_dim else (None, None)
@@ -183,7 +183,7 @@ class WithAttitude(MethodWrapper):
         local, step = AttitudeChartSystem(system, self.order, g), self.increment(h, k)
         new_g = g @ group.exp_map(group.algebra, local.rotation_angles(step))
         keeps_orbit, p_compensation = (
-            moves_by_transport_alone(system.body) and self._transporting_method.can_transport_attitude(system.body),
+            moves_by_transport_alone(system.body) and self._checked_inner_method.can_transport_attitude(system.body),
             None,
         )
         if system.impulse_dim:
@@ -229,7 +229,7 @@ class WithAttitude(MethodWrapper):
         )
         xi = (
             h
-            * self._transporting_method.stage_velocities(system.body, mu, mu_compensation, h, k)[:, : system.group.dim]
+            * self._checked_inner_method.stage_velocities(system.body, mu, mu_compensation, h, k)[:, : system.group.dim]
         )
         if self.kind == "exp" or (self.kind == "coadjoint" and len(xi) > 1):
             return g @ group.exp_map(

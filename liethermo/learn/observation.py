@@ -18,7 +18,7 @@ from ..errors import FunctionError, IndexOutOfRangeError, InputError
 from ..functions.time_span import required_argument_count
 from ..results.solution import Solution
 from ..systems import System
-from ..tracing.index_check import checked_result_shapes
+from ..tracing.index_check import check_indices_and_return_shapes
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 
 
@@ -166,7 +166,7 @@ def make_observation(
             names[:] = list(entry_names(observed_values)) if isinstance(observed_values, Mapping) else []
             return _observation_as_array(observed_values)
 
-        output_shape = checked_result_shapes(evaluate_and_record_names, *zero_state, parameters)
+        output_shape = check_indices_and_return_shapes(evaluate_and_record_names, *zero_state, parameters)
     except IndexOutOfRangeError as error:
         raise error.with_function(f"observe, at a state of shape ({system.dim},),") from None
     except KeyError as error:

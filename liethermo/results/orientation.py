@@ -379,7 +379,7 @@ def orientation_and_velocity_variables(solution: AuditableResult, dims: tuple[st
 
 
 def orientation_series_by_name(solution: AuditableResult) -> dict[str, np.ndarray]:
-    """Return quaternions and, if the inertia is known, nutation, precession and spin of a run by name.
+    """Return a dict of a run's quaternions and, if the inertia is known, its nutation, precession and spin.
 
     The result is empty without attitudes in SO(3).
     """

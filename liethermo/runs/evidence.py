@@ -325,9 +325,9 @@ class StepChecker:
     def _smallest_defects_of_shorter_steps(
         self, steps: StepSample, field_rounding_floor: np.ndarray
     ) -> tuple[np.ndarray, ReplayedSteps]:
-        """Return the smallest defect over steps of decreasing size from each state, shape (m,), and the largest steps.
+        """Replay each step with sizes h, h/8, ...; return the smallest defects, shape (m,), and the steps of size h.
 
-        The defect is NaN if all these steps fail. The largest step has the size of the given one.
+        A defect is NaN if all these steps fail.
         """
         step_indices = np.repeat(np.arange(len(steps.h)), STEP_REFINEMENTS)
         sizes = steps.h[:, None] / 8.0 ** np.arange(STEP_REFINEMENTS)

@@ -101,7 +101,7 @@ def build_solution(
 
 
 def velocities_at_states(velocity_name: str, system: System, states: np.ndarray) -> np.ndarray:
-    """Return one kind of velocity, shape (..., k), at states of a prepared system, shape (..., n)."""
+    """Return the velocities of a name, shape (..., k), at states, shape (..., n), of the system that is integrated."""
     rows = np.asarray(states).reshape(-1, states.shape[-1])
     return np.asarray(evaluate_at_points(_velocities_by_name, system, rows)[velocity_name]).reshape(
         *states.shape[:-1], -1

@@ -223,7 +223,7 @@ class AttitudeSystem(LiftedSystem):
         """Return the velocity xi of the attitude at a state, ``g' = g hat(xi)``, shape (group.dim,)."""
         mu, body = self.body_states(x), self.body_at_attitude(x)
         dS = body.entropy_gradient(mu)
-        xi = body.transport_covector(
+        xi = body.driving_covector(
             mu, body.energy.gradient(mu), dS, tuple(L.gradient(mu) for L in body.preserved_functions)
         )
         return xi[: self.group.dim]
@@ -259,7 +259,7 @@ def _attitude_residual(system: AttitudeSystem, x) -> jax.Array:
 
 
 def _spatial_momentum_and_scale(system: AttitudeSystem, x) -> tuple[jax.Array, jax.Array]:
-    """Return the spatial momentum minus the impulse, and the size of the largest term in a component of it."""
+    """Return the spatial momentum minus the impulse, and the size of the terms that cancel in it."""
     (state, g), p = system.attitude_layout.split_state(x), system.attitude_layout.impulse(x)
     mu, action = state[: system.group.dim], system.momentum_to_space_matrix(g)
     momentum = mu @ action
@@ -315,7 +315,7 @@ class AttitudeChartSystem(LiftedSystem):
     def field(self, x, dH, dS, dL=()):
         body, arguments = self.inner_system_at(x), self.restrict_to_inner_state(x, dH, dS, dL)
         algebra = self.attitude_system.group.algebra
-        velocity = body.transport_covector(*arguments)[: algebra.dim]
+        velocity = body.driving_covector(*arguments)[: algebra.dim]
         angle_rates = maps.inverse_dexp(algebra, self.rotation_angles(x), velocity, self.order)
         rates = [body.field(*arguments), ANGLE_UNIT * angle_rates]
         if self.torque_laws.has_impulse:

@@ -244,7 +244,7 @@ class System(SystemInterface):
         dH, dL = system.energy.gradient(x), tuple(L.gradient(x) for L in dissipation.preserve)
         return jax.jacfwd(lambda dS: dissipation.force(system, x, dH, dS, dL))(jnp.zeros(self.dim))
 
-    def transport_covector(self, x, dH, dS, dL=()) -> jax.Array:
+    def driving_covector(self, x, dH, dS, dL=()) -> jax.Array:
         """Return the covector, shape (body_dim,), that Pi maps to the velocity of the body without torques.
 
         It is dH plus the velocities of the dissipations [:meth:`liethermo.Dissipation.velocity`], for the body without

@@ -195,7 +195,7 @@ REPLACED_MEMBERS = {
     "freeze_at": "cache_tensors_at",
     "surface": "constraint_surface",
     "solve_at_spins": "solve_slopes_at_each_spin",
-    "transport": "transport_covector",
+    "transport": "driving_covector",
     "energy_of_vectors": "energy_of_flat_states",
     "inner": "inner_system",
 }

@@ -351,7 +351,7 @@ MAX_BODY_DIM = 64
 
 @functools.lru_cache(maxsize=64)
 def _leading_casimirs(algebra: mf.LieAlgebra, basis_names: tuple[str, ...] | None) -> dict[str, Energy]:
-    """Return the Casimirs of an algebra, by name, as energies."""
+    """Return, by name, the Casimirs of an algebra that are of low degree and quick to evaluate, as energies."""
     del basis_names  # a key of the cache: equal algebras may differ in the names with which their Casimirs print
     casimirs: dict[str, Energy] = {}
     with jax.ensure_compile_time_eval():  # the cache outlives any trace

@@ -48,8 +48,8 @@ class LiftedSystem(System):
         n = self.inner_system.dim
         return x[:n], dH[:n], None if dS is None else dS[:n], tuple(L[:n] for L in dL)
 
-    def transport_covector(self, x, dH, dS, dL=()):
-        return self.inner_system_at(x).transport_covector(*self.restrict_to_inner_state(x, dH, dS, dL))
+    def driving_covector(self, x, dH, dS, dL=()):
+        return self.inner_system_at(x).driving_covector(*self.restrict_to_inner_state(x, dH, dS, dL))
 
     def raise_index(self, x, alpha):
         n = self.inner_system.dim

@@ -223,7 +223,7 @@ class ChetaevSystem(SimpleClosedSystem):
         structure, dim, energy = self._build_contact_structure(lagrangian, dim, space)
         self.friction = self.external = self.heat_power = None
         self.form = SemibasicForm.from_function(eta, (dim // 2,) if space is None else space.shape)
-        forces = ForcesAndHeat(law=_find_entropy_law(self.form, structure.contact))
+        forces = ForcesAndHeat(law=_entropy_law_by_sampling(self.form, structure.contact))
         self._build_with_ledger(structure, dim, energy, forces, momentum_maps, validate, self._state_space(space))
 
     def friction_at_temperature(self, arguments, T) -> jax.Array:
@@ -253,10 +253,10 @@ class SemibasicForm(Module):
         function = eta if is_implicit else LastArgumentIgnored(eta)
         function = function if len(shape) == 1 else FlattenedFunction(function, shape)
         arguments = f"(q, v, S), q and v of shape {shape}"
-        function, checked_result_shapes = traced_function_and_shape(
+        function, check_indices_and_return_shapes = traced_function_and_shape(
             function, ((n,), (n,), (), ()), ((n + 1,), (n,)), "eta", arguments
         )
-        return cls(function if checked_result_shapes == (n + 1,) else _UnitEntropyForm(function), is_implicit)
+        return cls(function if check_indices_and_return_shapes == (n + 1,) else _UnitEntropyForm(function), is_implicit)
 
     def entropy_rate(self, q, v, S) -> jax.Array:
         """Return the rate S', shape (), at which the form vanishes on the motion; NaN if Newton's method fails."""
@@ -287,7 +287,7 @@ class _UnitEntropyForm(Module):
         return jnp.append(jnp.asarray(self.function(*arguments)), 1.0)
 
 
-def _find_entropy_law(form: SemibasicForm, contact: mf.SplitContact) -> LawName | None:
+def _entropy_law_by_sampling(form: SemibasicForm, contact: mf.SplitContact) -> LawName | None:
     """Return the entropy law of a one-form, from the sign of its entropy production at random states."""
     if is_traced(form):
         return None

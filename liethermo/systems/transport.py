@@ -16,7 +16,7 @@ def dissipation_velocities(system: SystemInterface, x, dH, dS, dL) -> list[jax.A
 
 
 def moves_by_transport_alone(system: SystemInterface) -> bool:
-    """Return whether Pi times :meth:`.System.transport_covector` is the whole motion, without external torques.
+    """Return whether Pi times :meth:`.System.driving_covector` is the whole motion, without external torques.
 
     If so, the spatial momentum of a body on a Lie algebra is constant.
     """

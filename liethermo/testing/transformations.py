@@ -171,7 +171,7 @@ class _LocalFunction(Module):
 
 
 def add_constant(energy: Energy, constant: float) -> Energy:
-    """Return an energy plus a constant, which is added to the last term."""
+    """Return an energy plus a constant; its last term takes up the constant."""
     *leading_terms, last_term = energy.terms
     if isinstance(last_term, Quadratic):
         last_term = Quadratic(last_term.A, last_term.b, last_term.c + constant)

@@ -220,7 +220,7 @@ MAX_TABLE_STRIDE = 256
 """Largest distance in memory that is tried between the entries of a table of which only one is not fixed."""
 
 
-def replace_constants_by_strided_inputs(
+def name_constants_found_in_an_input(
     entries: Sequence[Scalar], fixed_inputs: Sequence[np.ndarray | None]
 ) -> Sequence[Scalar]:
     """Replace the constants of a table by names of inputs if all its entries then are equidistant in one input array.
@@ -333,7 +333,7 @@ class ProgramBuilder:
                 self._defining_instruction(a) == (a, "item", (block_result, start + i)) for i, a in enumerate(entries)
             ):
                 return self._emit("column", block_result, start, len(entries))
-        return self._emit("table", *replace_constants_by_strided_inputs(entries, self.fixed_inputs))
+        return self._emit("table", *name_constants_found_in_an_input(entries, self.fixed_inputs))
 
     def input_positions_or_none(self, scalars: Sequence[Scalar]) -> list[tuple[int, int]] | None:
         """Return the (array, entry) indices of these scalars among the inputs of the outermost program.

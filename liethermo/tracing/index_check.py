@@ -26,7 +26,7 @@ def check_indices(closed_jaxpr: ClosedJaxpr) -> None:
         raise IndexOutOfRangeError(error.index, error.size, error.where, access=error.access) from None
 
 
-def checked_result_shapes(function: Callable, *arguments) -> Any:
+def check_indices_and_return_shapes(function: Callable, *arguments) -> Any:
     """Return the shapes of the results of a function, as ``jax.eval_shape`` does, after checking its indices."""
     closed_jaxpr, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
     check_indices(closed_jaxpr)

@@ -53,7 +53,7 @@ def SO(n: int) -> MatrixGroup:
     if n == 3:
         group = replace(group, exp_map=closed.exp_so3, log_map=closed.log_so3, adjoint_cayley_map=closed.cayley_so3)
         return replace(group, cayley_map=closed.cayley_so3, inverse_cayley_map=closed.inverse_cayley_so3)
-    return replace(group, adjoint_cayley_map=closed.adjoint_cayley_so4) if n == 4 else group
+    return replace(group, adjoint_cayley_map=closed.element_with_cayley_adjoint_so4) if n == 4 else group
 
 
 @register((2,), (3,))

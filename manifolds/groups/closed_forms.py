@@ -138,7 +138,7 @@ def adjoint_cayley_gl2(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     return jnp.exp(half) * (identity + X) / _sqrt_or_nan(1.0 + square)
 
 
-def adjoint_cayley_so4(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+def element_with_cayley_adjoint_so4(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Return the rotation g of R^4 with ``Ad(g) = cay(ad x)``, by the self-dual and anti-self-dual parts of hat(x)."""
     X, identity = algebra.hat(x), jnp.eye(4)
     rows = [[X[..., i, j] for j in range(4)] for i in range(4)]

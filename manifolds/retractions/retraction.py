@@ -207,7 +207,7 @@ class Chart(Retraction):
 
     _reach = forward_to("space")
 
-    def _midpoint_reach(self, z, v):
+    def _midpoint_relative_length(self, z, v):
         """Return the reach of the step v with z in its middle."""
         return self.space._reach(z, v)
 

@@ -342,7 +342,7 @@ r"""Implementation of each kernel on arrays of shape (count, \*shape)."""
 
 
 def _call_function_on_host(
-    space: GeomstatsSpace, function: Callable, checked_result_shapes: tuple[int, ...], dtype, arrays
+    space: GeomstatsSpace, function: Callable, check_indices_and_return_shapes: tuple[int, ...], dtype, arrays
 ):
     """Call ``function`` on the host, on arrays with one batch axis, from a JAX program with any number of batch
     axes."""
@@ -351,10 +351,13 @@ def _call_function_on_host(
     def run_on_host(*arrays):
         host_batch = arrays[0].shape[: arrays[0].ndim - len(space.shape)]
         result = function(*(np.asarray(a).reshape(-1, *space.shape) for a in arrays))
-        return result.reshape((*host_batch, *checked_result_shapes)).astype(dtype)
+        return result.reshape((*host_batch, *check_indices_and_return_shapes)).astype(dtype)
 
     return jax.pure_callback(
-        run_on_host, jax.ShapeDtypeStruct((*batch, *checked_result_shapes), dtype), *arrays, vmap_method="broadcast_all"
+        run_on_host,
+        jax.ShapeDtypeStruct((*batch, *check_indices_and_return_shapes), dtype),
+        *arrays,
+        vmap_method="broadcast_all",
     )
 
 
@@ -410,9 +413,9 @@ def _log_jvp(space: GeomstatsSpace, primals, tangents):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _jacobian(space: GeomstatsSpace, kernel: str, arrays):
-    checked_result_shapes = (math.prod(space._result_shape(kernel)), len(arrays) * math.prod(space.shape))
+    check_indices_and_return_shapes = (math.prod(space._result_shape(kernel)), len(arrays) * math.prod(space.shape))
     return _call_function_on_host(
-        space, partial(space._jacobian_on_host, kernel), checked_result_shapes, np.float64, arrays
+        space, partial(space._jacobian_on_host, kernel), check_indices_and_return_shapes, np.float64, arrays
     )
 
 

@@ -208,7 +208,7 @@ class CompiledStepLoop:
         return *adaptive_state.state, *adaptive_state[1:]
 
     def _make_newton_fallback(self, noise_increments) -> Callable:
-        """Return the function that replaces Newton's method in a step: a program that is compiled at first use."""
+        """Return the function that stands in for Newton's method in a step: it calls code compiled at first use."""
 
         def bind_deferred_newton(fixed_point_result: StageSolution, *stage_inputs) -> StageSolution:
             initial_outputs = [1.0 * getattr(fixed_point_result, name) for name in NEWTON_OUTPUTS]
