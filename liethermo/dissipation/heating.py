@@ -130,7 +130,7 @@ class Heating(LiftedDissipation):
         return scale(sign, scale(dS_y, dH[:body_dim]) - scale(T, dS[:body_dim]))
 
     def bath_values_at_sites(self, bath_values) -> jax.Array:
-        """Return values of baths, shape (m,), at the sites that heat them, shape () or (sites,)."""
+        """Return for each site, shape () or (sites,), the value of the bath that it heats, from those of all (m,)."""
         return (
             bath_values[np.asarray(self.bath).ravel()]
             if self.has_site_baths

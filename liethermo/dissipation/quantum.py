@@ -227,7 +227,7 @@ class ThermalJumps(Dissipation):
     has_generator = True
 
     def generator_field(self, system, x, dH):
-        """Return the force as Lindblad's equation, without a logarithm, followed by the bath entropy rates."""
+        """Return the rate of rho by Lindblad's equation, which needs no logarithm, and then the bath entropy rates."""
         structure, n = system.structure, system.body_dim
         rho, omega = self._to_jump_frame(structure.matrix(x[:n])), self._jump_frequencies(structure, dH[:n])
         T = jnp.asarray(jnp.inf) if self.is_isolated else dH[n + self.bath]

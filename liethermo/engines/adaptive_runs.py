@@ -32,7 +32,7 @@ from .step_control import (
     AdaptiveState,
     StepControl,
     largest_growth_rate_by_arnoldi,
-    max_growth_rates,
+    max_moduli_of_growing_eigenvalues,
     max_step_times_growth_rate_for_accuracy,
 )
 
@@ -410,7 +410,7 @@ class PauseHandler:
         """Compute the growth rates of trajectories, and limit their next steps by them."""
         probes, runs = self.adaptive_runs.read("jacobian_probe", indices), self.adaptive_runs
         if probes.shape[2] <= DENSE_JACOBIAN_DIM:
-            rates = max_growth_rates(probes)
+            rates = max_moduli_of_growing_eigenvalues(probes)
         else:
             x = runs.read("x", indices)
             rates = np.array(

@@ -385,7 +385,7 @@ def frobenius_norm(matrix) -> jax.Array:
     return jnp.sqrt(jnp.sum(matrix * matrix))
 
 
-def max_growth_rates(matrices: np.ndarray) -> np.ndarray:
+def max_moduli_of_growing_eigenvalues(matrices: np.ndarray) -> np.ndarray:
     """Return the largest modulus of growing eigenvalues of each matrix, shape (...), of matrices (..., n, n)."""
     is_finite = np.isfinite(matrices).all(axis=(-2, -1))
     rates = np.linalg.eigvals(np.where(is_finite[..., None, None], matrices, 0.0))
@@ -394,4 +394,4 @@ def max_growth_rates(matrices: np.ndarray) -> np.ndarray:
 
 def largest_growth_rate_by_arnoldi(system: System, method: OneStepMethod, x) -> float:
     """Return the largest growth rate of the linear motion at x, by Arnoldi's method, for large systems."""
-    return float(max_growth_rates(np.asarray(arnoldi_hessenberg(system, method, jnp.asarray(x)))))
+    return float(max_moduli_of_growing_eigenvalues(np.asarray(arnoldi_hessenberg(system, method, jnp.asarray(x)))))

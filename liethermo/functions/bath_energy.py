@@ -16,7 +16,7 @@ from manifolds._arrays import is_traced
 from ..errors import InputError
 from .conditions import ParameterCondition
 from .energy import Energy, Linear, Pullback, SpanLimitedEnergy, StateTimeEnergy
-from .frames import sum_terms
+from .frames import sum_arrays
 from .indices import Components, pattern_of_matrix, sparsity_pattern
 from .path import CollocationPath
 from .time_span import TimeSpan
@@ -240,19 +240,19 @@ class BodyBathsEnergy(Energy):
         return (self.body, Components(range(self.body_dim))), (self.baths, Components(range(self.body_dim, self.dim)))
 
     def value(self, x) -> jax.Array:
-        return sum_terms(energy.value(components(x)) for energy, components in self._energies_and_components)
+        return sum_arrays(energy.value(components(x)) for energy, components in self._energies_and_components)
 
     def gradient(self, x) -> jax.Array:
         return jnp.concatenate([energy.gradient(components(x)) for energy, components in self._energies_and_components])
 
     def sensitivity(self, x) -> jax.Array:
-        return sum_terms(energy.sensitivity(components(x)) for energy, components in self._energies_and_components)
+        return sum_arrays(energy.sensitivity(components(x)) for energy, components in self._energies_and_components)
 
     def rounding_scale(self, x) -> jax.Array:
-        return sum_terms(energy.rounding_scale(components(x)) for energy, components in self._energies_and_components)
+        return sum_arrays(energy.rounding_scale(components(x)) for energy, components in self._energies_and_components)
 
     def difference_rounding_scale(self, x) -> jax.Array:
-        return sum_terms(
+        return sum_arrays(
             term.difference_rounding_scale(components(x))
             for energy, components in self._energies_and_components
             for term in energy.terms
@@ -266,14 +266,14 @@ class BodyBathsEnergy(Energy):
                 energy is self.body and energy.is_quadratic
             ):  # at the midpoint of the whole state, which other terms use too
                 return components(scheme.quadratic(Pullback(energy, components), *arrays))
-            return sum_terms(term.discrete_gradient(scheme, *map(components, arrays)) for term in energy.terms)
+            return sum_arrays(term.discrete_gradient(scheme, *map(components, arrays)) for term in energy.terms)
 
         return jnp.concatenate([energy_discrete_gradient(*pair) for pair in self._energies_and_components])
 
     def stage_gradients(self, scheme, path: CollocationPath) -> jax.Array:
         def energy_stage_gradients(energy: Energy, components: Components) -> jax.Array:
             component_path, _ = path.path_and_pullback_in(components)
-            return sum_terms(term.stage_gradients(scheme, component_path) for term in energy.terms)
+            return sum_arrays(term.stage_gradients(scheme, component_path) for term in energy.terms)
 
         return jnp.concatenate([energy_stage_gradients(*pair) for pair in self._energies_and_components], axis=1)
 

@@ -47,11 +47,11 @@ class OrthonormalFrame(NamedTuple):
 
     def coefficients(self, v) -> jax.Array:
         """Return w, shape (m,), for which ``sum_l w_l vectors[l]`` is the component of v in the span."""
-        return sum_terms(jnp.dot(e, v) * c for e, c in zip(self.unit_vectors, self.combinations, strict=True))
+        return sum_arrays(jnp.dot(e, v) * c for e, c in zip(self.unit_vectors, self.combinations, strict=True))
 
     def vector_with_inner_products(self, products) -> jax.Array:
         """Return the vector in the span, shape (n,), that has given inner products with the given vectors."""
-        return sum_terms(jnp.dot(c, products) * e for e, c in zip(self.unit_vectors, self.combinations, strict=True))
+        return sum_arrays(jnp.dot(c, products) * e for e, c in zip(self.unit_vectors, self.combinations, strict=True))
 
     def _residual_and_coefficients(self, v) -> tuple[jax.Array, list[jax.Array]]:
         """Return v without its component in the span, and its coefficients in the unit vectors."""
@@ -148,7 +148,7 @@ def _safe_inverse_sqrt(square, is_usable):
     return jnp.where(is_usable, 1.0 / jnp.sqrt(jnp.where(is_usable, square, 1.0)), 0.0)
 
 
-def sum_terms(terms: Iterable[jax.Array]) -> jax.Array:
+def sum_arrays(terms: Iterable[jax.Array]) -> jax.Array:
     """Return the sum of arrays, without a zero at the start."""
     first_term, *other_terms = terms
     return sum(other_terms, first_term)

@@ -28,7 +28,7 @@ from manifolds._pytree_module import Module
 
 from ..errors import InputError
 from .energy import Energy
-from .frames import gram_schmidt, sqrt_or_zero, sum_terms
+from .frames import gram_schmidt, sqrt_or_zero, sum_arrays
 from .path import CollocationPath, KronrodRule
 
 EPS = float(np.finfo(np.float64).eps)
@@ -78,7 +78,7 @@ class DiscreteGradient(Module):
 
     def __call__(self, energy: Energy, x, d, compensation=0.0) -> jax.Array:
         """Return the discrete gradient of an energy from x + compensation to x + compensation + d, shape (n,)."""
-        return sum_terms(term.discrete_gradient(self, x, d, compensation) for term in energy.terms)
+        return sum_arrays(term.discrete_gradient(self, x, d, compensation) for term in energy.terms)
 
     def quadratic(self, term: Energy, x, d, compensation) -> jax.Array:
         """Return the discrete gradient of a quadratic term, the exact gradient at the midpoint."""
@@ -265,7 +265,7 @@ def discrete_gradients_at_stages(
     u = x + (compensation + h * (A @ k))
     kronrod_samples = None if kronrod is None else (x + (compensation + h * (kronrod.A @ k)), kronrod.slope_matrix @ k)
     path = CollocationPath(x, compensation, h * (b @ k), u, k, kronrod_samples, symmetries, h, b, kronrod)
-    return sum_terms(term.stage_gradients(_corrected_stage_gradients, path) for term in energy.terms)
+    return sum_arrays(term.stage_gradients(_corrected_stage_gradients, path) for term in energy.terms)
 
 
 def _corrected_stage_gradients(term: Energy, path: CollocationPath, correction_weights=None) -> jax.Array:

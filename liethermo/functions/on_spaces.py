@@ -28,7 +28,7 @@ from ..tracing.short_form import callable_name
 from .bath_energy import BodyBathsEnergy
 from .energy import Energy, Function, Multiple, Negative, Pullback, Quadratic, Sum, TimeDependent
 from .indices import ComponentMap
-from .magnetism.spin_energy import SpinEnergy, flatten_covectors, lattice_spins
+from .magnetism.spin_energy import SpinEnergy, flatten_covectors, lattice_spin_components
 
 
 class PointEnergyOnVectors(Energy):
@@ -267,7 +267,7 @@ class PlanarSpinEnergy(Energy):
         sites = {energy.sites for energy in self.spin_energies}
         return {
             shape: PaddedLattice(
-                lattice_spins(x, shape, planar=True), interaction_range(Sum(self.spin_energies), shape)
+                lattice_spin_components(x, shape, planar=True), interaction_range(Sum(self.spin_energies), shape)
             )
             for shape in sites
         }

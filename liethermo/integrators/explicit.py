@@ -193,9 +193,9 @@ class ExplicitMethod(TransportingMethod):
     def requested_invariants(self, system: System) -> tuple[Energy, ...]:
         return tuple(function_on_states(system, C) for C in self.functions)
 
-    def _with_transformed_functions(self, transform: Callable, held_names: tuple[str, ...]) -> Self:
+    def _with_transformed_functions(self, transform: Callable, also_conserved: tuple[str, ...]) -> Self:
         """Return the method with transformed preserved functions, holding the system's functions of these names."""
-        return type(self)(self.number, tuple(map(transform, self.functions)), self.retraction, held_names)
+        return type(self)(self.number, tuple(map(transform, self.functions)), self.retraction, also_conserved)
 
     def check(self, system: System) -> None:
         """Raise InputError unless the system has a law to hold and conserves the functions that are to be preserved."""

@@ -170,26 +170,28 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         self.moving = moving
 
     def on(self, system: System, tolerance: float | None = None) -> OneStepMethod:
-        held_names = tuple(sorted(name for name in system.first_integrals() if self._is_held_by_default(system, name)))
-        method = self._with_transformed_functions(lambda C: function_on_states(system, C), held_names)
+        also_conserved = tuple(
+            sorted(name for name in system.first_integrals() if self._is_held_by_default(system, name))
+        )
+        method = self._with_transformed_functions(lambda C: function_on_states(system, C), also_conserved)
         if self.functions and not is_traced((system, method)):
             residuals = evaluate_at_points(casimir_residuals, (system, method.functions), system.samples(4))
             momentum_maps = tuple(int(i) for i in np.flatnonzero(is_momentum_map(residuals)))
-            method = method._with_transformed_functions(lambda C: C, held_names, momentum_maps)
+            method = method._with_transformed_functions(lambda C: C, also_conserved, momentum_maps)
         return wrap_in_charts(method, system, self.retraction, "exp")
 
     def requested_invariants(self, system: System) -> tuple[Energy, ...]:
         return tuple(function_on_states(system, C) for C in self.functions)
 
     def _with_transformed_functions(
-        self, transform: Callable, held_names: tuple[str, ...], momentum_maps: tuple[int, ...] | None = None
+        self, transform: Callable, also_conserved: tuple[str, ...], momentum_maps: tuple[int, ...] | None = None
     ):
         """Return a copy with ``transform`` applied to its preserved functions.
 
-        The copy conserves the first integrals of the system in ``held_names`` too.
+        The copy conserves the first integrals of the system in ``also_conserved`` too.
         """
         return type(self)(
-            self.number, tuple(map(transform, self.functions)), self.retraction, held_names, momentum_maps
+            self.number, tuple(map(transform, self.functions)), self.retraction, also_conserved, momentum_maps
         )
 
     preserves = frozenset({"energy", "entropy_law", "casimirs"})

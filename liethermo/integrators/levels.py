@@ -375,9 +375,9 @@ def level_correction(
 def correction_displacement(
     system: System, x, correction, follow_leaf: bool = False, momentum_dim: int = 0
 ) -> jax.Array:
-    """Return the displacement of x by a correction: the correction itself, or along a leaf that of its covector.
+    """Return the displacement of x by a correction: itself, or with ``follow_leaf`` the motion along the leaf by it.
 
-    The covector is minus the correction: ``dH . Pi K = -(Pi dH) . K`` gives its sign.
+    The covector of this motion is minus the correction: ``dH . Pi K = -(Pi dH) . K`` gives its sign.
     """
     if follow_leaf:
         return system.poisson.leaf_displacement(x, -correction)

@@ -125,7 +125,7 @@ def _are_nonnegative(moments):
     return (moments >= 0.0) & (moments < np.inf)
 
 
-def _are_positive_or_of_rods(moments):
+def _allowed_moments_mask(moments):
     """Return True for each moment, shape (..., 3), that is positive, or zero and of a slender rod."""
     xp = np if isinstance(moments, np.ndarray) else jnp
     _, median, largest = xp.moveaxis(xp.sort(moments, axis=-1), -1, 0)
@@ -142,7 +142,7 @@ def _are_tensors_of_bodies(tensors):
 
 
 INERTIA_CONDITION = ParameterCondition(
-    _are_positive_or_of_rods,
+    _allowed_moments_mask,
     POSITIVE_MOMENTS_TEXT,
     _are_tensors_of_bodies,
     "a tensor of inertia must be symmetric and positive definite, got {value}",

@@ -18,7 +18,7 @@ from manifolds._pytree_module import Module
 from ..errors import InputError
 from ..functions.energy import Energy, Pullback, Sum
 from ..systems.base import System
-from ..systems.interface import EngineHints, MotionQuantities
+from ..systems.interface import BodyKinematics, EngineHints
 from ..tracing.programs import jit_unoptimised
 from .articulated_bodies import ArticulatedBodies, JointDamping, JointSprings, KineticEnergy, Motion
 from .parameters import checked_finite
@@ -114,8 +114,8 @@ class TreeSystem(System):
         }
 
     @property
-    def motion_quantities(self) -> MotionQuantities:
-        quantities = super().motion_quantities
+    def body_kinematics(self) -> BodyKinematics:
+        quantities = super().body_kinematics
         if not self.joint_ranges:
             return quantities
         start, k = self.joint_ranges[0][1] + self.mechanism.n_joints, self.mechanism.n_joints

@@ -20,7 +20,7 @@ from ..errors import InputError
 from ..functions.energy import Energy, Quadratic
 from ..systems import HeatBaths, LiePoissonSystem
 from ..systems.body_states import append_bath_entropies, broadcast_batches
-from ..systems.interface import MotionQuantities, TorqueLaws
+from ..systems.interface import BodyKinematics, TorqueLaws
 from ..tracing.programs import jit_unoptimised
 from .articulated_bodies import ArticulatedBodies, JointSprings, KineticEnergy, SquaredMomentum
 from .joint_states import (
@@ -134,8 +134,8 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         return {name: SquaredMomentum(C, kinetic) for name, C in self.momentum_casimirs().items()}
 
     @property
-    def motion_quantities(self) -> MotionQuantities:
-        return super().motion_quantities._replace(momentum_scale=KineticEnergy(self.mechanism).momentum_scale)
+    def body_kinematics(self) -> BodyKinematics:
+        return super().body_kinematics._replace(momentum_scale=KineticEnergy(self.mechanism).momentum_scale)
 
     @property
     def inertia(self) -> None:

@@ -311,7 +311,7 @@ class Ensemble(AuditableResult):
     def audit(
         self, energy: float = Tolerances.energy, entropy: float = Tolerances.entropy, **tolerances: float
     ) -> Audit:
-        """Audit the laws at every step of every trajectory; each row shows the worst trajectory.
+        """Audit the laws of energy and entropy at every step of every trajectory; each row shows the worst trajectory.
 
         Steps are examined along at most 32 trajectories (with adaptive steps, the first of each). Conserved
         functions, and conditions such as the positivity of density matrices, are evaluated at the saved states of these
@@ -398,7 +398,7 @@ class Ensemble(AuditableResult):
 
     @classmethod
     def from_file(cls, series: dict[str, np.ndarray], attributes: dict[str, Any]) -> Ensemble:
-        """Build an ensemble from the arrays and attributes of a file, as :func:`.netcdf.read_dataset` returns them.
+        """Build an ensemble from the arrays and attributes of a file: see :func:`.netcdf.read_variables_and_attributes`.
 
         KeyError, TypeError or ValueError if a part is missing or does not fit.
         """

@@ -15,7 +15,7 @@ from ..systems.rotations import rotation_matrices
 from ..units import parse_unit, split_label
 from .audit_evidence import AuditableResult
 from .ensemble import Ensemble
-from .netcdf import ENSEMBLE_FORMAT, read_dataset
+from .netcdf import ENSEMBLE_FORMAT, read_variables_and_attributes
 from .orientation import angular_velocity, euler_angles, quaternions
 from .solution import Solution
 
@@ -212,7 +212,7 @@ def load(path: str | os.PathLike) -> Solution | Ensemble:
     >>> bool((lt.load("run.nc").x == solution.x).all())
     True
     """
-    series, attributes = read_dataset(path)
+    series, attributes = read_variables_and_attributes(path)
     try:
         if attributes["format"] == ENSEMBLE_FORMAT:
             return Ensemble.from_file(series, attributes)

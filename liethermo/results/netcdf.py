@@ -180,7 +180,7 @@ def _use_synchronous_dask() -> Iterator[None]:
         yield
 
 
-def read_dataset(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def read_variables_and_attributes(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return the variables and the attributes of a file that :func:`write_dataset` wrote, after checking it.
 
     Raises

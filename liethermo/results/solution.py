@@ -368,7 +368,7 @@ class Solution(AuditableResult):
 
     @classmethod
     def from_file(cls, series: dict[str, np.ndarray], attributes: dict[str, Any]) -> Solution:
-        """Build a solution from the arrays and attributes of a file, as :func:`.netcdf.read_dataset` returns them.
+        """Build a solution from the arrays and attributes of a file: see :func:`.netcdf.read_variables_and_attributes`.
 
         KeyError, TypeError or ValueError if a part is missing or does not fit.
         """

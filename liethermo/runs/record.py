@@ -208,11 +208,11 @@ class EnsembleRecord:
         return reshape_to_sites(self.member, ensemble)
 
     def _velocity_getters_by_name(self) -> dict[str, Callable[[], np.ndarray]]:
-        """Return functions that compute the velocities of all trajectories, by the names of the velocities."""
+        """Return, by the name of each velocity, a function that computes it along all trajectories."""
         if self.x is None and self.trajectories is None:
             return {}
         return {
-            name: functools.partial(self._compute_velocities, name) for name in self.member.motion_quantities.velocities
+            name: functools.partial(self._compute_velocities, name) for name in self.member.body_kinematics.velocities
         }
 
     def _compute_velocities(self, velocity_name: str) -> np.ndarray:

@@ -36,7 +36,7 @@ class RecordedFunctions(NamedTuple):
     has_user_states : bool
         Whether the states of a run already have the user's form.
     velocity_names : tuple of str
-        Names of the velocities that the system has: see :attr:`liethermo.System.motion_quantities`.
+        Names of the velocities that the system has: see :attr:`liethermo.System.body_kinematics`.
     """
 
     invariants: dict[str, Energy]
@@ -49,9 +49,7 @@ class RecordedFunctions(NamedTuple):
         """Return the recorded functions of a system, from the result of :func:`.preparation.invariants_and_laws`."""
         functions = {name: f for name, (f, _) in invariants.items()}
         has_user_states = type(system).to_user_solution is System.to_user_solution and not system.sites
-        return cls(
-            functions, {**functions, **system.ledger}, has_user_states, tuple(system.motion_quantities.velocities)
-        )
+        return cls(functions, {**functions, **system.ledger}, has_user_states, tuple(system.body_kinematics.velocities))
 
 
 def build_solution(
@@ -110,7 +108,7 @@ def velocities_at_states(velocity_name: str, system: System, states: np.ndarray)
 
 def _velocities_by_name(system: System, x) -> dict[str, Any]:
     """Return all velocities of a system at a state, shape (n,), as a dict from names to arrays, shape (k,)."""
-    return {name: velocity(x) for name, velocity in system.motion_quantities.velocities.items()}
+    return {name: velocity(x) for name, velocity in system.body_kinematics.velocities.items()}
 
 
 def run_provenance(
@@ -126,7 +124,7 @@ def run_provenance(
 
     ``end_time`` is the time at which the run ended, in seconds as of ``time.time()``; by default now.
     """
-    joint_ranges = system.motion_quantities.joint_ranges
+    joint_ranges = system.body_kinematics.joint_ranges
     algebra, group, inertia = system.lie_algebra, system.matrix_group, system.inertia
     return {
         "library": f"liethermo {_library_version()}",

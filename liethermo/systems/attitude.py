@@ -263,7 +263,7 @@ def _spatial_momentum_and_scale(system: AttitudeSystem, x) -> tuple[jax.Array, j
     (state, g), p = system.attitude_layout.split_state(x), system.attitude_layout.impulse(x)
     mu, action = state[: system.group.dim], system.momentum_to_space_matrix(g)
     momentum = mu @ action
-    scale = jnp.maximum(jnp.max(jnp.abs(mu) @ jnp.abs(action)), system.body.motion_quantities.momentum_scale(state))
+    scale = jnp.maximum(jnp.max(jnp.abs(mu) @ jnp.abs(action)), system.body.body_kinematics.momentum_scale(state))
     return momentum - p if system.impulse_dim else momentum, scale
 
 

@@ -48,7 +48,7 @@ def is_given_by_velocity(system, x, angular_velocity, alternative: str, **veloci
         return False
     if x is not None:
         raise InputError("state needs x or angular_velocity=, got both")
-    if "angular_velocity" not in system.motion_quantities.velocities:
+    if "angular_velocity" not in system.body_kinematics.velocities:
         raise InputError(f"a system on {system.algebra.name} has no angular velocity. Give its {alternative}")
     return True
 

@@ -83,7 +83,7 @@ class EmbeddedSystem(System):
 
     @property
     def domain(self) -> Domain:
-        name, why_singular = _require_space(self.manifold_system).name, self.manifold_system.domain.why_singular
+        name, why_singular = _space_of(self.manifold_system).name, self.manifold_system.domain.why_singular
         return Domain(f"a point of {name}", self._why_outside, why_singular)
 
     ledger = forward_to("manifold_system")
@@ -94,10 +94,10 @@ class EmbeddedSystem(System):
 
     @property
     def constraint_surface(self) -> ConstraintSurface:
-        return ConstraintSurface(_require_space(self.manifold_system), self.is_tangent)
+        return ConstraintSurface(_space_of(self.manifold_system), self.is_tangent)
 
     def _why_outside(self, x) -> str:
-        space, x = _require_space(self.manifold_system), np.atleast_2d(x)
+        space, x = _space_of(self.manifold_system), np.atleast_2d(x)
         if not np.isfinite(x).all():
             return ""
         is_inside = evaluate_at_points(_inside_indicator, self.constraint_surface, x) > 0.0
@@ -194,7 +194,7 @@ def embed_in_arrays(system: System) -> System:
 
 def _sample_states(system: System) -> np.ndarray:
     """Return three random states, shape (3, n), without compiling a program if the space allows it."""
-    space = _require_space(system)
+    space = _space_of(system)
     if space._n_gaussian_samples is None:
         return system.samples(3)
     return evaluate_at_points(
@@ -218,7 +218,7 @@ def _tangency_residuals(system: System, x):
     A field is tangent if it conserves the constraints and does not depend on normal components of covectors. The
     second value is separate, because off the manifold the projection need not be a projector.
     """
-    constraints, pull = jax.vjp(functools.partial(_constraint_values, _require_space(system)), x)
+    constraints, pull = jax.vjp(functools.partial(_constraint_values, _space_of(system)), x)
     random, n_covectors = np.random.default_rng(1), 3 + len(system.preserved_functions)
     covectors = random.standard_normal((n_covectors, x.shape[0]))
     normals = [pull(jnp.asarray(w))[0] for w in random.standard_normal((n_covectors, *constraints.shape))]
@@ -226,7 +226,7 @@ def _tangency_residuals(system: System, x):
     for dH, dS, _, *dL in (covectors, [a + b for a, b in zip(covectors, normals, strict=True)]):
         fields.append(system.field(x, dH, None if system.entropy is None else dS, tuple(dL)))
     norm = jnp.max(jnp.abs(fields[0]))
-    constraint_rates = jax.jvp(functools.partial(_constraint_values, _require_space(system)), (x,), (fields[0],))[1]
+    constraint_rates = jax.jvp(functools.partial(_constraint_values, _space_of(system)), (x,), (fields[0],))[1]
     residual = jnp.maximum(jnp.max(jnp.abs(fields[1] - fields[0])), jnp.max(jnp.abs(constraint_rates), initial=0.0))
     change = jnp.max(jnp.abs(_tangential_part(system, x, fields[0]) - fields[0]))
     return jnp.stack([residual, change]) / jnp.where(norm > 0.0, norm, 1.0)
@@ -239,7 +239,7 @@ def _constraint_values(space: mf.Space, x):
 
 def _tangential_part(system: System, x, w):
     """Return an array w without the component that would change the constraints of the space."""
-    return _tangential_part_in_space(_require_space(system), x, w)
+    return _tangential_part_in_space(_space_of(system), x, w)
 
 
 @jit_subprogram
@@ -247,7 +247,7 @@ def _tangential_part_in_space(space: mf.Space, x, w):
     return space.to_vector(space._tangential_part(space.from_vector(x), space.from_vector(w)))
 
 
-def _require_space(system: System) -> mf.Space:
+def _space_of(system: System) -> mf.Space:
     assert system.space is not None
     return system.space
 

@@ -26,7 +26,7 @@ from ..functions.newton import inverse_gradient
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.traced import trace_callables
 from .body_states import checked_velocity, is_given_by_velocity
-from .interface import EngineHints, MotionQuantities
+from .interface import BodyKinematics, EngineHints
 from .ledger import LedgerSystem
 from .lie_poisson import LiePoissonSystem, body_velocity_slices
 from .states import evaluate_batch
@@ -334,9 +334,9 @@ class EulerPoincareClosedSystem(LedgerSystem):
         return structure.momentum_and_derivatives(x[: self.dim_without_ledger])[1:]
 
     @property
-    def motion_quantities(self) -> MotionQuantities:
+    def body_kinematics(self) -> BodyKinematics:
         parts = body_velocity_slices(self.algebra)
-        return MotionQuantities({name: lambda x, part=part: x[part] for name, part in parts.items()})
+        return BodyKinematics({name: lambda x, part=part: x[part] for name, part in parts.items()})
 
     def temperature_at(self, y) -> jax.Array:
         return -jax.grad(self.lagrangian, argnums=1)(y[:-1], y[-1])

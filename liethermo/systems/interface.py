@@ -58,7 +58,7 @@ class OrbitLevels(NamedTuple):
     has_all_casimirs: bool = False
 
 
-class MotionQuantities(NamedTuple):
+class BodyKinematics(NamedTuple):
     """Velocities and joints of rigid bodies in a system, for its solutions.
 
     Attributes
@@ -183,7 +183,7 @@ REPLACED_MEMBERS = {
     "has_all_casimirs": "orbit_levels",
     "sparsity_pattern": "sparse_newton",
     "residual_weights": "sparse_newton",
-    "velocity_functions": "motion_quantities",
+    "velocity_functions": "body_kinematics",
     "hints": "engine_hints",
     "preserved": "preserved_functions",
     "component_scales": "slope_scales",
@@ -244,9 +244,9 @@ class SystemInterface(Geometry):
         return None
 
     @property
-    def motion_quantities(self) -> MotionQuantities:
+    def body_kinematics(self) -> BodyKinematics:
         """Functions that compute velocities of rigid bodies from a state; empty for systems without bodies."""
-        return MotionQuantities()
+        return BodyKinematics()
 
     @property
     def inner_system(self) -> SystemInterface | None:

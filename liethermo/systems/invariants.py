@@ -121,7 +121,10 @@ def first_proportional_indices(gradients: np.ndarray, n_last: int) -> np.ndarray
 
 
 def find_invariants(system: SystemInterface, near_states=None, include_declared: bool = True) -> InvariantVerdicts:
-    """Return the names of conserved and undecided functions; ``include_declared`` adds preserved ones not refuted."""
+    """Return the names of conserved functions and of undecided ones.
+
+    With ``include_declared`` an undecided function that is declared as preserved counts as conserved.
+    """
     if system.invariant_verdicts is not None:
         return system.invariant_verdicts
     verdicts = (

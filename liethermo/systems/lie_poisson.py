@@ -21,7 +21,7 @@ from ..tracing.caching import memoize
 from ..tracing.interpret import evaluate_at_points
 from .baths import BathEntropy, HeatBaths
 from .body_states import append_bath_entropies, checked_velocity, is_given_by_velocity, momentum_of_velocity
-from .interface import TORQUE_FREE_LAWS, MotionQuantities, OrbitLevels, TorqueLaws
+from .interface import TORQUE_FREE_LAWS, BodyKinematics, OrbitLevels, TorqueLaws
 from .torque import (
     MAX_ARGUMENTS,
     MAX_ARGUMENTS_WITHOUT_ATTITUDE,
@@ -150,9 +150,9 @@ class LiePoissonSystem(TorqueSystem):
         return _inertia_tensor(energy, self.algebra.dim) if energy.is_quadratic else None
 
     @property
-    def motion_quantities(self) -> MotionQuantities:
+    def body_kinematics(self) -> BodyKinematics:
         parts = body_velocity_slices(self.algebra)
-        quantities = MotionQuantities(
+        quantities = BodyKinematics(
             {name: lambda x, part=part: self.energy.gradient(x)[part] for name, part in parts.items()}
         )
         if "rotor_rates" not in parts:

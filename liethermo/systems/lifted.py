@@ -12,7 +12,7 @@ from ..dissipation.base import LiftedDissipation, LiftedGeometry
 from ..functions.energy import Energy
 from .base import System
 from .domain import Domain
-from .interface import EngineHints, MotionQuantities
+from .interface import BodyKinematics, EngineHints
 
 
 class LiftedSystem(System):
@@ -77,11 +77,11 @@ class LiftedSystem(System):
         return self.inner_system
 
     @property
-    def motion_quantities(self) -> MotionQuantities:
-        n, inner = self.inner_system.dim, self.inner_system.motion_quantities
+    def body_kinematics(self) -> BodyKinematics:
+        n, inner = self.inner_system.dim, self.inner_system.body_kinematics
 
         def velocity(name: str, x):
-            return self.inner_system_at(x).motion_quantities.velocities[name](x[:n])
+            return self.inner_system_at(x).body_kinematics.velocities[name](x[:n])
 
         return inner._replace(
             velocities={name: partial(velocity, name) for name in inner.velocities},

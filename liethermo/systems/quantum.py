@@ -216,7 +216,9 @@ class QuantumSystem(System):
     def state_array(self, x, batch: bool = False):
         """Return the state x, checked; a matrix or a ket becomes the state with all bath entropies zero."""
         x = self._array_of_qobj(x)
-        if not isinstance(x, jax.core.Tracer) and (self._is_matrix(x, batch) or self._is_ket(x)):
+        if not isinstance(x, jax.core.Tracer) and (
+            self._is_matrix(x, batch) or self._has_shape_of_ket_or_stacked_operator(x)
+        ):
             x = np.asarray(self.state(x))
         return super().state_array(x, batch)
 
@@ -227,7 +229,7 @@ class QuantumSystem(System):
         array = np.asarray(x.full())  # an array of shape (1, N^2) that is no Qobj is a batch of one state
         return adjoint(array) if array.shape == (1, self.structure.size**2) and self.structure.size > 1 else array
 
-    def _is_ket(self, x) -> bool:
+    def _has_shape_of_ket_or_stacked_operator(self, x) -> bool:
         """Return whether x has the shape of a ket, a bra or a stacked operator; False for one level."""
         size = self.structure.size
         return size > 1 and np.shape(x) in ((size,), (size, 1), (1, size), (size**2, 1))

@@ -92,7 +92,10 @@ class RunInOneCall:
 
 @functools.cache
 def _compile_run_in_one_call() -> MachineCode:
-    """Return the machine code of ``run(description)``: 1 if a step fails or needs Newton's method, otherwise 0."""
+    """Return the machine code of ``run(description)``.
+
+    Its result is 1 if a step fails or needs Newton's method, and otherwise 0.
+    """
     module = ir.Module("run")
     description = ir.LiteralStructType(FIELD_TYPES.values()).as_pointer()
     function = ir.Function(module, ir.FunctionType(INT64, [description]), "run")
@@ -233,7 +236,7 @@ class CompiledTrajectory:
         self._addresses = [array.ctypes.data for array in (self.parameters, self._block, self._n_done)]
 
     def start(self, x, planned_steps: int = 0) -> None:
-        """Start a trajectory at x, shape (n,); ``planned_steps`` decides on optimisation."""
+        """Start a trajectory at x, shape (n,); its machine code is optimised if ``planned_steps`` are many."""
         begin, _ = self._loop.loop_functions(0, planned_steps)
         self._status[0], self._x[:] = 0.0, x
         begin(self._addresses[0], self._addresses[1], 1)

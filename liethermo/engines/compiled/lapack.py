@@ -93,7 +93,7 @@ class _KernelWriter:
         total = sum(map(math.prod, shapes)) * self.parts_per_entry
         all_finite = build.alloca(ir.IntType(1))
         build.store(ir.Constant(ir.IntType(1), 1), all_finite)
-        for i in self._write_loop(total):
+        for i in self._loop_range(total):
             value = build.load(self._lane_entry_pointer(self.input_pointer, i))
             difference = build.fsub(value, value)  # NaN for infinity
             is_finite = build.fcmp_ordered("==", difference, ir.Constant(FLOAT64, 0.0))
@@ -145,7 +145,7 @@ class _KernelWriter:
             ],
         )
         self._copy_output(0, a, m, n)
-        for i in self._write_loop(n_pivots):  # LAPACK counts from 1
+        for i in self._loop_range(n_pivots):  # LAPACK counts from 1
             pivot_index = self.builder.sub(self.builder.load(self.builder.gep(pivots, [i])), ir.Constant(INT32, 1))
             self.builder.store(self.builder.sitofp(pivot_index, FLOAT64), self._output_entry_pointer(1, i))
 
@@ -195,8 +195,8 @@ class _KernelWriter:
         self._call_routine("zgeqrf" if is_complex else "dgeqrf", factorise_arguments)
         r = self._allocate_doubles(columns * n * self.parts_per_entry)
         build = self.builder
-        for j in self._write_loop(n):
-            for i in self._write_loop(columns):
+        for j in self._loop_range(n):
+            for i in self._loop_range(columns):
                 source = self._matrix_entry_pointer(a, i, j, m)
                 for part in range(self.parts_per_entry):
                     value = build.load(build.gep(source, [ir.Constant(INT64, part)]))
@@ -267,8 +267,8 @@ class _KernelWriter:
     def _copy_input(self, start: int, m: int, n: int, width: int | None = None) -> ir.Value:
         """Copy an m by n input to new LAPACK storage, with room for ``width`` columns; return its pointer."""
         build, a = self.builder, self._allocate_doubles(m * (width or n) * self.parts_per_entry)
-        for i in self._write_loop(m):
-            for j in self._write_loop(n):
+        for i in self._loop_range(m):
+            for j in self._loop_range(n):
                 offset = build.add(build.mul(i, ir.Constant(INT64, n)), j)
                 for part in range(self.parts_per_entry):
                     source = self._lane_entry_pointer(
@@ -281,8 +281,8 @@ class _KernelWriter:
     def _copy_output(self, result_index: int, a: ir.Value, m: int, n: int) -> None:
         """Copy an m by n matrix from LAPACK's storage to a result of the kernel."""
         build = self.builder
-        for i in self._write_loop(m):
-            for j in self._write_loop(n):
+        for i in self._loop_range(m):
+            for j in self._loop_range(n):
                 offset = build.add(build.mul(i, ir.Constant(INT64, n)), j)
                 for part in range(self.parts_per_entry):
                     value = build.load(build.gep(self._matrix_entry_pointer(a, i, j, m), [ir.Constant(INT64, part)]))
@@ -293,12 +293,12 @@ class _KernelWriter:
 
     def _copy_output_vector(self, result_index: int, w: ir.Value, n: int) -> None:
         """Copy a vector of n doubles to a result of the kernel."""
-        for i in self._write_loop(n):
+        for i in self._loop_range(n):
             self.builder.store(self.builder.load(self.builder.gep(w, [i])), self._output_entry_pointer(result_index, i))
 
     def _write_nan(self) -> None:
         """Write NaN to all results of the kernel."""
-        for i in self._write_loop(len(self.call.result_kinds)):
+        for i in self._loop_range(len(self.call.result_kinds)):
             self.builder.store(ir.Constant(FLOAT64, math.nan), self._lane_entry_pointer(self.output_pointer, i))
 
     # -- what LAPACK is told ------------------------------------------------------------------------------------------
@@ -345,7 +345,7 @@ class _KernelWriter:
             with failure_branch:
                 self._write_nan()
 
-    def _write_loop(self, count: int):
+    def _loop_range(self, count: int):
         """Write a loop whose body is that of the Python ``for``; yield its counter."""
         with self.writer.loop_range(ir.Constant(INT64, count)) as i:
             yield i

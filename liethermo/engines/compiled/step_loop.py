@@ -173,7 +173,7 @@ class CompiledStepLoop:
     # -- what is compiled -----------------------------------------------------------------------------------------
 
     def build_modules(self, p) -> list[Any]:
-        """Return the system, the method and, for an adaptive run, the step control with parameters p, shape (p,)."""
+        """Return the system, the method and, for an adaptive run, the step control, built from the parameters p."""
         ends = itertools.accumulate(structure.n_parameters for structure in self._structures)
         return [
             structure.build(p[end - structure.n_parameters : end])

@@ -59,10 +59,10 @@ class SpinEnergy(Energy):
         return self.multiple(-1.0)
 
     def value(self, x) -> jax.Array:
-        return self.lattice_value(PeriodicSpins(lattice_spins(x, self.sites)))
+        return self.lattice_value(PeriodicSpins(lattice_spin_components(x, self.sites)))
 
     def gradient(self, x) -> jax.Array:
-        return flatten_covectors(self.lattice_gradients(PeriodicSpins(lattice_spins(x, self.sites))), x)
+        return flatten_covectors(self.lattice_gradients(PeriodicSpins(lattice_spin_components(x, self.sites))), x)
 
     def check_components(self, dim: int, role: str) -> None:
         check_spin_count(self.sites, dim, role)
@@ -71,7 +71,7 @@ class SpinEnergy(Energy):
         return flattened_spins(x, self.sites)
 
 
-def lattice_spins(x, sites: tuple[int, ...], planar: bool = False) -> VectorComponents:
+def lattice_spin_components(x, sites: tuple[int, ...], planar: bool = False) -> VectorComponents:
     """Return the components of the spins of a state, each of the shape of the sites."""
     return reshape_vectors(spin_components_from_state(x, math.prod(sites), planar), sites)
 

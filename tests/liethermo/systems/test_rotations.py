@@ -162,7 +162,7 @@ def test_a_state_has_the_angular_velocity_and_temperature_it_was_given(name):
     rates = {"rotor_rates": 0.5 + np.arange(n_rotors)} if n_rotors else {}
     heat = {} if name == "rigid body" else {"temperature": 1.7}
     x0 = system.state(angular_velocity=omega, **rates, **heat)
-    assert np.allclose(system.motion_quantities.velocities["angular_velocity"](x0), omega, atol=1e-15)
+    assert np.allclose(system.body_kinematics.velocities["angular_velocity"](x0), omega, atol=1e-15)
     if isinstance(system, lt.LiePoissonSystem):
         assert np.allclose(system.energy.gradient(x0)[3 : 3 + n_rotors], 0.5 + np.arange(n_rotors), atol=1e-14)
     if name == "body with wheels":
