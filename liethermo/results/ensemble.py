@@ -398,7 +398,7 @@ class Ensemble(AuditableResult):
 
     @classmethod
     def from_file(cls, series: dict[str, np.ndarray], attributes: dict[str, Any]) -> Ensemble:
-        """Build an ensemble from the arrays and attributes of a file: see :func:`.netcdf.read_variables_and_attributes`.
+        """Build an ensemble from arrays and attributes of a file: see :func:`.netcdf.read_variables_and_attributes`.
 
         KeyError, TypeError or ValueError if a part is missing or does not fit.
         """
