@@ -58,7 +58,7 @@ class State(NamedTuple):
 
 
 class SavedStates(NamedTuple):
-    """The states that a call of an engine saved, without those that were not reached."""
+    """The states that one call of an engine saved, up to the last save time that the run reached."""
 
     x: np.ndarray  # shape (saves, n)
     energy_and_entropy: np.ndarray  # shape (saves, 2)

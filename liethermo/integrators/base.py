@@ -387,8 +387,9 @@ def collocation_error_estimate(system: System, x, compensation, h, k) -> jax.Arr
     """Estimate the local error, O(h^{2s+1}), of collocation at s Gauss nodes from the residual of its polynomial u.
 
     The residual ``f(x) - u'(0)`` at the start is O(h^s) relative to the speed [Hairer & Wanner 1996, IV.8]. The method
-    has order 2s, so the error of a step of length h|k| is the square of the relative residual. The divisor 2s + 1 makes
-    the estimate right, to a factor that tends to 1, for a linear oscillation of any amplitude.
+    has order 2s, so the local error is estimated as the length of the step, h|k|, times the square of the relative
+    residual, divided by 2s + 1. This divisor makes the estimate right, to a factor that tends to 1, for a linear
+    oscillation of any amplitude.
 
     The part of the residual that rounding may explain is subtracted: it does not shrink with h, and near a rest at the
     origin nothing else is left.

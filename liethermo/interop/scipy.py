@@ -106,7 +106,7 @@ def solve_ivp(
     method : OneStepMethod, optional
         ``MetriplecticRungeKutta(order=8)`` by default; take ``MetriplecticGauss(3)`` for stiff systems.
     t_eval : array of times, increasing, optional
-        Keep the states there, and no others. Steps end there, so the laws hold there.
+        Return the states at these times only. Steps end there, so the laws hold there.
     dense_output : bool
         Give ``sol``, the state at any time.
     events : function of t, y and the ``args``, or several, optional

@@ -241,7 +241,7 @@ class _Labels:
         """
         text = self.unit_text(label)
         if not isinstance(text, str):
-            raise InputError(f"units must be names such as 'deg/s', got {text!r} for {self.names[label]!r}")
+            raise InputError(f"a unit must be a name such as 'deg/s', got {text!r} for {self.names[label]!r}")
         try:
             return parse_unit(text)
         except InputError as error:

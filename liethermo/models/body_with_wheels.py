@@ -70,9 +70,9 @@ def body_with_wheels(
     """A body with three wheels, one about each body axis, whose bearing friction heats it.
 
     ``l = sum I_i Omega_i^2 / 2 + sum J_i (Omega_i + w_i)^2 / 2 - C T_0 exp(S / C)`` on so(3) + R^3, ``f = -k w`` on the
-    wheels alone, in the state (Omega, w, S). No friction acts on the rotation as a whole, so the spatial angular
-    momentum is constant; the energy of the motion falls to ``|mu|^2 / (2 max(I + J))``, of a spin about the axis of
-    greatest inertia with the wheels at rest, and what is lost heats the body: ``T = T_0 exp(S / C)``.
+    wheels alone, in the state (Omega, w, S). The friction is internal, so the spatial angular momentum is constant. The
+    kinetic energy falls to ``|mu|^2 / (2 max(I + J))``, its value in a spin about the axis of greatest inertia with the
+    wheels at rest. The lost energy heats the body to ``T = T_0 exp(S / C)``.
 
     Parameters
     ----------

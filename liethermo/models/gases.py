@@ -271,9 +271,10 @@ def mass_spring_gas_solution(
 ) -> np.ndarray:
     """Return the exact states (x, v, S) at times t after x0, shape (..., 3), below, at and above critical damping.
 
-    ``x = e^(-kappa t) (x_0 C + (v_0 + kappa x_0) D)`` with ``kappa = lambda / 2m``, ``omega^2 = k/m - kappa^2`` and
-    ``C, D = cos(omega t), sin(omega t)/omega``, or ``1, t``, or the hyperbolic ones: (5.6) and its other branches. What
-    the mass loses the gas gains, ``c N R (T - T(0)) = f(t)``, and ``S = S(0) + c N R log(T / T(0))`` (5.8, 5.9).
+    ``x = e^(-kappa t) (x_0 C + (v_0 + kappa x_0) D)`` with ``kappa = lambda / 2m`` and ``omega^2 = k/m - kappa^2``.
+    Below critical damping ``C, D = cos(omega t), sin(omega t)/omega`` (5.6); at critical damping ``C, D = 1, t``; above
+    it C and D are the hyperbolic functions of ``|omega| t``. The gas gains the energy f(t) that the mass loses,
+    ``c N R (T - T(0)) = f(t)``, and its entropy is ``S = S(0) + c N R log(T / T(0))`` (5.8, 5.9).
 
     Parameters
     ----------

@@ -96,7 +96,9 @@ class EnsembleField(Measure):
         field = {"final": "x"}.get(self.name, self.name.removeprefix("final_"))
         values = getattr(ensemble, field)
         if values is None:
-            raise InputError(f"the system has no {field}, so the measure {self.name!r} does not exist")
+            raise InputError(
+                f"the measure {self.name!r} needs {field}, which the system does not have. Leave it out of measures="
+            )
         return _final_values(values, ensemble) if self.name.startswith("final") or self.name == "work" else values, {}
 
     def description(self) -> str:

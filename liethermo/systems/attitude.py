@@ -40,7 +40,7 @@ IMPULSE_NAME = "impulse"
 
 
 class AttitudeSystem(LiftedSystem):
-    """A Lie-Poisson system for mu together with ``g' = g hat(transport(mu))`` [:doc:`/explanation/exact_laws`].
+    """A Lie-Poisson system for mu together with ``g' = g hat(xi(mu))`` [:doc:`/explanation/exact_laws`].
 
     A state consists of the state of the body, mu first, and the entries of g row by row; imaginary parts follow for
     complex groups. If a torque tau acts, the accumulated impulse comes last, ``p' = Ad_star(inverse(g), tau)``. Energy,
@@ -275,7 +275,7 @@ which the momentum alone determines, be it 1e20 or 1e-20. It is a power of two, 
 class AttitudeChartSystem(LiftedSystem):
     """A body in exponential coordinates (mu, theta) around a fixed attitude g; its attitude is ``g exp(hat(theta))``.
 
-    ``theta' = dexp(theta)^-1 transport(mu)`` [Munthe-Kaas 1999]: a system on a vector space, for one step of a method
+    ``theta' = dexp(theta)^-1 xi(mu)`` [Munthe-Kaas 1999]: a system on a vector space, for one step of a method
     that needs no more. The laws are those of mu. Theta is in units of
     :data:`ANGLE_UNIT`, and so is the spatial impulse that follows it if a torque acts.
 

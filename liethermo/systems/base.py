@@ -248,8 +248,8 @@ class System(SystemInterface):
         """Return the covector, shape (body_dim,), that Pi maps to the velocity of the body without torques.
 
         It is dH plus the velocities of the dissipations [:meth:`liethermo.Dissipation.velocity`], for the body without
-        baths; the gradients are continuous or discrete. On a Lie algebra an attitude follows it:
-        ``g' = g hat(transport)``.
+        baths; the gradients are continuous or discrete. On a Lie algebra the attitude g obeys
+        ``g' = g hat(xi)``, where xi is this covector.
         """
         total = dH[: self.body_dim]
         for sigma in dissipation_velocities(self, x, dH, dS, dL):

@@ -62,8 +62,8 @@ class LiePoissonSystem(TorqueSystem):
     group : manifolds.MatrixGroup, optional
         A group of this algebra. If the algebra is a sum with an abelian one, as for a body with internal wheels, the
         group may be that of the first summand. :func:`liethermo.integrate` then returns attitudes g(t) too, with
-        ``g' = g hat(xi)``. Here xi is :meth:`transport`: the gradient of H, and the velocity that internal friction
-        adds. The momentum in space is ``Ad_star(inverse(g), mu)``, and it is constant if no torque acts.
+        ``g' = g hat(xi)``. Here xi is :meth:`driving_covector`: the gradient of H, and the velocity that internal
+        friction adds. The momentum in space is ``Ad_star(inverse(g), mu)``, and it is constant if no torque acts.
     reconstruction : {"coadjoint", "cayley", "exp"}, optional
         The map of the attitude. The default conserves the spatial momentum of a free body, if the group has such a
         map; otherwise it is Cayley's map, or ``"exp"``, which stays in every group.

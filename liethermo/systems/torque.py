@@ -230,7 +230,7 @@ def _checked_argument_count(term: Any) -> int:
     count = len(term.program.argument_avals) if isinstance(term, TracedFunction) else required_argument_count(term)
     if count is None or not 1 <= count <= MAX_ARGUMENTS:
         raise InputError(
-            "a torque is a function of t, of t and mu, or of t, mu and the attitude, or of these and the velocity "
-            f"dH/dmu, but {torque_name(term)} needs {'an unknown number of' if count is None else count} arguments"
+            "a torque must be a function of (t), (t, mu), (t, mu, attitude) or (t, mu, attitude, dH/dmu), but "
+            f"{torque_name(term)} needs {'an unknown number of' if count is None else count} arguments"
         )
     return count
