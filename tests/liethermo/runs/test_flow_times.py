@@ -131,7 +131,7 @@ def test_a_fit_to_a_table_finds_its_parameters():
         ({"save_at": [0.1], "save_every": 2}, "got both"),
         ({"parameters": {"nothing": 1.0}}, "no parameter 'nothing'"),
         ({"parameters": {"dissipation.rate": [1.0, 2.0]}}, r"dissipation\.rate must have shape \(\), got \(2,\)"),
-        ({"parameters": [1.0]}, "dict by the names"),
+        ({"parameters": [1.0]}, "dict from names"),
     ],
 )
 def test_arguments_that_do_not_fit_are_refused(keywords, words):
