@@ -1,8 +1,7 @@
 """One BLAS thread for programs that factorise small matrices.
 
-OpenBLAS divides a factorisation among its threads from some 18 rows on, and threads without work wait in busy loops. An
-eigendecomposition of 64 rows then takes ten to forty times the processor time, and on a machine with other work it
-takes longer by the clock too.
+OpenBLAS divides a factorisation among its threads from some 18 rows on, and threads without work wait in busy loops. On
+a machine with other work an eigendecomposition of 64 rows then takes ten to forty times the processor time.
 """
 
 from __future__ import annotations
