@@ -167,19 +167,39 @@ def checked_numbers(value, quantity_name: str, *shapes: tuple[int, ...]) -> jax.
     InputError
         If the value is not made of real numbers, or has another shape.
     """
-    try:
-        kind = "f" if is_traced(value) else (value if isinstance(value, jax.Array) else np.asarray(value)).dtype.kind
-        if kind not in "biufO" or value is None:  # NumPy would convert strings to numbers, and None to NaN
-            raise TypeError(f"not {kind}")
-        array = real_array(value)
-    except (TypeError, ValueError) as error:
-        description = repr(value) if isinstance(value, str | complex | None) else type(value).__name__
-        raise InputError(f"{quantity_name} must be made of real numbers, got {description}") from error
+    array = _converted_numbers(value, quantity_name, real_array)
     if shapes == ((),) and array.shape:
         raise InputError(f"{quantity_name} must be one number, got an array of shape {array.shape}")
     if shapes and array.shape not in shapes:
         raise InputError(f"{quantity_name} must have shape {' or '.join(map(str, shapes))}, got {array.shape}")
     return array
+
+
+def checked_host_numbers(value, quantity_name: str) -> np.ndarray:
+    """Return a user's numbers, none of them traced, as a NumPy array of float64.
+
+    A conversion to an array of JAX takes longer than a short run.
+
+    Raises
+    ------
+    InputError
+        If the value is not made of real numbers.
+    """
+    if is_traced(value):
+        return np.asarray(value)  # an error of JAX, for which callers say what to use under a transformation
+    return _converted_numbers(value, quantity_name, lambda value: np.asarray(value, dtype=np.float64))
+
+
+def _converted_numbers(value, quantity_name: str, convert: Callable) -> Any:
+    """Return ``convert(value)``; raise InputError unless the value is made of real numbers."""
+    try:
+        kind = "f" if is_traced(value) else (value if isinstance(value, jax.Array) else np.asarray(value)).dtype.kind
+        if kind not in "biufO" or value is None:  # NumPy would convert strings to numbers, and None to NaN
+            raise TypeError(f"not {kind}")
+        return convert(value)
+    except (TypeError, ValueError) as error:
+        description = repr(value) if isinstance(value, str | complex | None) else type(value).__name__
+        raise InputError(f"{quantity_name} must be made of real numbers, got {description}") from error
 
 
 def condition_message(message_template: str, value) -> str:

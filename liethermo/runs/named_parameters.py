@@ -15,7 +15,7 @@ from manifolds._arrays import host_array, real_array
 
 from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
 from ..errors import InputError
-from ..functions.conditions import ParameterCondition, checked_numbers, condition_of_field
+from ..functions.conditions import ParameterCondition, checked_host_numbers, checked_numbers, condition_of_field
 from ..functions.energy import Quadratic
 from ..models.inertia import INERTIA_CONDITION, inverse_moments
 from ..systems import System
@@ -154,7 +154,7 @@ def stack_member_arrays(system: System, member_values: Mapping[str, Any]) -> lis
     leaves = [array[None] for array in parameter_arrays(system)]
     names_by_leaf: dict[int, str] = {}
     for name, value in member_values.items():
-        parameter, array = require_parameter(system, name), np.asarray(checked_numbers(value, name))
+        parameter, array = require_parameter(system, name), checked_host_numbers(value, name)
         if array.ndim == 0 or array.shape[1:] != parameter.value.shape:
             expected_shape = ", ".join(["trajectories", *map(str, parameter.value.shape)])
             raise InputError(f"the values of {name} must have shape ({expected_shape}), got {array.shape}")

@@ -16,7 +16,7 @@ from manifolds._precision import with_library_settings
 from ..engines.select_engine import ENGINES
 from ..engines.status_codes import StatusCode
 from ..errors import ConvergenceError, FileError, InputError, NonFiniteError
-from ..functions.conditions import checked_numbers
+from ..functions.conditions import checked_host_numbers
 from ..functions.time_span import TIMES_OF_SMOOTH_FUNCTIONS, DeclaredTimes
 from ..integrators import OneStepMethod, Reference
 from ..results.ensemble import Ensemble
@@ -272,9 +272,7 @@ class Propagator(metaclass=ListedType):
             If the system has no parameter of this name, or a value has another shape or is refused by the constructor
             of its object, as a negative rate is.
         """
-        values = {
-            name: np.asarray(checked_numbers(value, name)) for name, value in checked_parameters(parameters).items()
-        }
+        values = {name: checked_host_numbers(value, name) for name, value in checked_parameters(parameters).items()}
         key = tuple((name, value.shape, value.tobytes()) for name, value in sorted(values.items()))
         return self._variants.get_or_compute(
             key,

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..engines.array_engine import MAX_SAVES_PER_CALL
 from ..errors import InputError
-from ..functions.conditions import checked_numbers
+from ..functions.conditions import checked_host_numbers
 from ..functions.gradients import EPS
 from ..functions.time_span import BREAK_RTOL, TIMES_OF_SMOOTH_FUNCTIONS, DeclaredTimes, checked_breaks
 from .adaptive import Adaptive
@@ -356,7 +356,7 @@ def _sorted_save_times_and_end(save_at, start: float, end: float, breaks: tuple[
     InputError
         If ``save_at`` is not a list of finite times within the span.
     """
-    times = np.atleast_1d(np.asarray(checked_numbers(save_at, "save_at")))
+    times = np.atleast_1d(checked_host_numbers(save_at, "save_at"))
     if times.ndim != 1 or not np.isfinite(times).all() or times.size == 0:
         raise InputError(f"save_at must be a list of times, got {save_at!r}")
     times = clip_times_to_span(times, start, end, "save_at")

@@ -16,7 +16,7 @@ from manifolds import ManifoldsError
 
 from ..engines.compiled.parameters import ProgramStructure, parameter_arrays
 from ..errors import InputError, LiethermoError
-from ..functions.conditions import checked_numbers
+from ..functions.conditions import checked_host_numbers
 from ..models.inertia import are_inertia_tensors
 from ..systems import System
 from ..systems.kind_checks import require_system
@@ -97,7 +97,7 @@ class Family:
             )
         for name, values in checked_parameters(parameters).items():
             has_moments = name.endswith("inertia") and require_parameter(system, name).value.shape == (3,)
-            if has_moments and are_inertia_tensors(np.asarray(checked_numbers(values, name))):
+            if has_moments and are_inertia_tensors(checked_host_numbers(values, name)):
                 raise InputError(
                     f"the values of {name} are the tensor of inertia of one body, but three sets of principal moments "
                     "are expected. Give the moments of each trajectory as a row, or a system with a tensor"

@@ -6,12 +6,12 @@ import dataclasses
 import enum
 import functools
 import hashlib
-import importlib.metadata
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
+import jaxlib
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
@@ -148,9 +148,10 @@ def compiler_fingerprint() -> bytes | None:
 
     None if the source files cannot be read.
     """
-    hasher, root = hashlib.sha256(), Path(__file__).parents[2]
-    for distribution in ("jax", "jaxlib", "llvmlite", "numpy"):
-        hasher.update(f"{distribution} {importlib.metadata.version(distribution)};".encode())
+    import llvmlite  # which the array engine does not need
+
+    versions = {module.__name__: module.__version__ for module in (jax, jaxlib, llvmlite, np)}
+    hasher, root = hashlib.sha256(f"{versions}".encode()), Path(__file__).parents[2]
     for room in SOURCE_ROOMS:
         try:
             files = sorted((root / room).rglob("*.py"))

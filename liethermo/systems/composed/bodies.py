@@ -17,7 +17,7 @@ from ...dissipation.bodies import Process
 from ...dissipation.checks import checked_semidefinite
 from ...errors import InputError
 from ...functions.checks import checked_energy, traced_function_and_shape, with_polynomial_degrees
-from ...functions.conditions import checked_numbers, require_condition
+from ...functions.conditions import checked_numbers, nonnegative_condition, require_condition
 from ...functions.energy import Energy, Quadratic, make_energy
 from ...functions.mechanics import Each
 
@@ -311,7 +311,7 @@ def _checked_coefficient(coefficient, what: str) -> jax.Array | Callable:
     if callable(coefficient):
         return coefficient
     value = checked_numbers(coefficient, what, ())
-    require_condition(value, lambda L: (L >= 0.0) & (np.inf > L), what + " must be >= 0 and finite, got {value}")
+    nonnegative_condition(what).require(value)
     return value
 
 
