@@ -155,7 +155,7 @@ BAD = {
     ),
     "unit that is no text": (
         lambda: lt.learn.read_data(table(), units={"x": 2}),
-        "must be names such as 'deg/s', got 2",
+        "must be a name such as 'deg/s', got 2",
     ),
     "time in degrees": (
         lambda: lt.learn.read_data(table(), units={"t": "deg"}),
