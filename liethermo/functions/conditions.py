@@ -190,6 +190,22 @@ def checked_host_numbers(value, quantity_name: str) -> np.ndarray:
     return _converted_numbers(value, quantity_name, lambda value: np.asarray(value, dtype=np.float64))
 
 
+def host_number(value, quantity_name: str) -> float:
+    """Return a user's number as a float.
+
+    Raises
+    ------
+    InputError
+        If the value is not one real number. A string is none, although ``float`` would convert it.
+    """
+    try:
+        if isinstance(value, str | bytes):
+            raise TypeError("a string")
+        return float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{quantity_name} must be a number, got {value!r:.60}") from None
+
+
 def _converted_numbers(value, quantity_name: str, convert: Callable) -> Any:
     """Return ``convert(value)``; raise InputError unless the value is made of real numbers."""
     try:
