@@ -218,6 +218,17 @@ def _converted_numbers(value, quantity_name: str, convert: Callable) -> Any:
         raise InputError(f"{quantity_name} must be made of real numbers, got {description}") from error
 
 
+MAX_PRINTED_ENTRIES = 12
+"""Largest array that a message prints whole: a matrix of rank 3, with some room."""
+
+
 def condition_message(message_template: str, value) -> str:
-    """Return the error message of a condition, from its template with a placeholder for the value."""
-    return message_template.format(value=np.asarray(value).tolist())
+    """Return the error message of a condition, from its template with a placeholder for the value.
+
+    An array of more than :data:`MAX_PRINTED_ENTRIES` numbers is described by its shape and its range.
+    """
+    array = np.asarray(value)
+    if array.size <= MAX_PRINTED_ENTRIES:
+        return message_template.format(value=array.tolist())
+    text = f"an array of shape {array.shape} with numbers from {array.min():.6g} to {array.max():.6g}"
+    return message_template.format(value=text)

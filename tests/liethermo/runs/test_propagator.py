@@ -133,8 +133,8 @@ BATHS_OF_TWO_KINDS = lt.HeatBaths([1.0, 2.0], [1.0, 0.5])
 @pytest.mark.parametrize(
     ("name", "invalid", "valid", "message"),
     [
-        ("dissipation.rate", -1.0, 0.3, r"a dissipation rate must be >= 0, got -1"),
-        ("dissipation.rate", np.nan, 0.3, r"a dissipation rate must be >= 0, got nan"),
+        ("dissipation.rate", -1.0, 0.3, r"a dissipation rate must be >= 0 and finite, got -1"),
+        ("dissipation.rate", np.nan, 0.3, r"a dissipation rate must be >= 0 and finite, got nan"),
         ("baths.capacity", [1.0, -2.0], [0.5, 2.0], r"the capacity of a bath must be positive, got \[1\.0, -2\.0\]"),
         ("baths.temperature", [0.0, 1.0], [0.5, 2.0], r"the temperature of a bath must be positive"),
     ],

@@ -493,7 +493,7 @@ BAD = {
     r"V\[0\] has shape \(3, 3\)": lambda q: lt.QuantumSystem(
         QUBIT, lt.ThermalJumps([(np.eye(3), 1.0)]), baths=infinite()
     ),
-    "rate must be >= 0": lambda q: lt.ThermalJumps([(LOWER, -1.0)]),
+    "rate must be >= 0 and finite": lambda q: lt.ThermalJumps([(LOWER, -1.0)]),
     r"V\[0\] is zero": lambda q: lt.ThermalJumps([(0.0 * LOWER, 1.0)]),
     "pairs": lambda q: lt.ThermalJumps([LOWER]),
     "bath 1, but there are 1": lambda q: lt.QuantumSystem(
