@@ -231,6 +231,7 @@ def with_noise_increments(method: OneStepMethod, dW) -> OneStepMethod:
 
 
 def _is_stochastic(node) -> bool:
+    """Return True if a node of a pytree is a StochasticMidpoint."""
     return isinstance(node, StochasticMidpoint)
 
 
@@ -247,6 +248,7 @@ def noise_invariance_by_name(system: System) -> dict[str, bool]:
 def _factor_residuals_and_noise_changes_at_samples(
     system: System,
 ) -> tuple[np.ndarray, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """Return :func:`_factor_residual_and_noise_changes` at four states of the system, along the first axis."""
     return evaluate_at_points(_factor_residual_and_noise_changes, system, system.samples(4))
 
 

@@ -161,6 +161,7 @@ class DiscreteHerglotz(OneStepMethod):
 
     @property
     def _substep_fractions(self) -> np.ndarray:
+        """Sizes of the substeps over that of the step, shape (stages,)."""
         return np.array([share for share, _ in SUBSTEPS[self.composed]])
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
@@ -215,7 +216,10 @@ def _adjoint_substep_slope(action: Callable, contact: mf.SplitContact, y, h, gue
 
 
 def _newton_velocity(residual: Callable, contact: mf.SplitContact, q, h, velocity_guess) -> jax.Array:
-    """Return the velocity after one Newton step for ``residual(q + h velocity) = 0``, on a manifold along it."""
+    """Return the velocity after one Newton step for ``residual(q + h velocity) = 0``.
+
+    On a manifold the equation is solved along it, and ``q + h velocity`` is brought onto it.
+    """
     A, residual_value = h * jax.jacfwd(residual)(q + h * velocity_guess), residual(q + h * velocity_guess)
     if isinstance(contact.bundle, mf.TangentBundle):
         surface, mass = ConstraintSurface(contact.bundle.base, tangent=True), jnp.max(jnp.abs(A))
