@@ -165,7 +165,7 @@ def project_onto_levels(
             d=d, surface_residual=surface_residual, level_residual=level_residuals(d, end_gradients)
         ), end_gradients
 
-    def drop_monotone_residuals(s: ProjectionState) -> ProjectionState:
+    def drop_allowed_monotone_residuals(s: ProjectionState) -> ProjectionState:
         """Return the state without the residuals of functions that rise or fall, if they do so with the right sign."""
         actual_changes, rounding = (
             target_changes - s.level_residual,
@@ -251,7 +251,7 @@ def project_onto_levels(
             current, end_gradients = apply_correction(current)
             current = current._replace(
                 level_residual=jnp.where(
-                    is_relaxed, drop_monotone_residuals(current).level_residual, current.level_residual
+                    is_relaxed, drop_allowed_monotone_residuals(current).level_residual, current.level_residual
                 )
             )
             direction_mask = (signs == 0.0) | ~is_relaxed | ((current.level_residual != 0.0) & ~is_last)

@@ -220,13 +220,13 @@ def vanishing_entry_indices(function: Callable, pytree: Any, *shapes: tuple[int,
 
 def _parameters_key_and_rebuilder(pytree: Any) -> tuple[list, Any, Callable]:
     """Return the parameters of a pytree (its float64 arrays), a key of all else, and a function that rebuilds it."""
-    dynamic, static = eqx.partition(pytree, _is_parameter)
+    dynamic, static = eqx.partition(pytree, _is_float64_array)
     leaves, structure = jax.tree_util.tree_flatten(dynamic)
     model_key = pytree_key_or_none(static), structure, tuple(np.shape(leaf) for leaf in leaves)
     return leaves, model_key, lambda arrays: eqx.combine(jax.tree_util.tree_unflatten(structure, arrays), static)
 
 
-def _is_parameter(leaf) -> bool:
+def _is_float64_array(leaf) -> bool:
     """Return whether a leaf of a pytree is a float64 array."""
     return eqx.is_inexact_array(leaf) and leaf.dtype == np.float64
 
