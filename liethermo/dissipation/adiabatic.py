@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..functions.bath_energy import BodyBathsEnergy
 from ..functions.density import matrix_logarithm
 from ..functions.indices import Indices
-from .operators import ENERGY_RTOL, commutator, is_hermitian, level_gap_rounding, subtract_common_energy
+from .operators import ENERGY_RTOL, commutator, is_hermitian, level_gap_rounding_bound, subtract_common_energy
 from .quantum import ThermalJumps, apply_jump_friction, cluster_labels
 
 ADIABATIC_LIMIT = 0.1
@@ -248,7 +248,7 @@ def _group_numbers_of_level_pairs(hamiltonians: list[np.ndarray]) -> np.ndarray:
     levels = np.stack([np.linalg.eigvalsh(subtract_common_energy(H)) for H in hamiltonians])
     gaps = levels[:, None, :] - levels[:, :, None]
     # eigenvalues of matrices that are not diagonal are rounded like them
-    tolerances = [size * level_gap_rounding(H) for H in hamiltonians]
+    tolerances = [size * level_gap_rounding_bound(H) for H in hamiltonians]
     labels = np.stack([cluster_labels(gap.ravel(), tolerance) for gap, tolerance in zip(gaps, tolerances, strict=True)])
     zero = (np.abs(gaps.reshape(len(gaps), -1)) <= np.array(tolerances)[:, None]).all(axis=0)
     _, group = np.unique(labels, axis=1, return_inverse=True)

@@ -34,7 +34,7 @@ from .operators import (
     is_commuting,
     is_diagonal,
     is_hermitian,
-    level_gap_rounding,
+    level_gap_rounding_bound,
     subtract_common_energy,
 )
 
@@ -129,7 +129,7 @@ class ThermalJumps(Dissipation):
             _checked_rate_function(rate, i) if callable(rate) else checked_rate(rate)
             for i, (_, rate) in enumerate(pairs)
         )
-        self.timed_rates = tuple(i for i, rate in enumerate(self.rates) if _takes_time(rate))
+        self.timed_rates = tuple(i for i, rate in enumerate(self.rates) if _rate_depends_on_time(rate))
         self.bath, self.jumps, self.jump_frame, self.level_order, self.is_driven = bath, (), None, (), False
         self.is_isolated, self.conserves_energy = False, True
 
@@ -461,7 +461,7 @@ def _checked_rate_function(rate: Callable, i: int) -> Callable:
     """Return a rate function of omega and T, or of omega, T and t, tested at omega = T = 1 and t = 0."""
     what = f"the rate of V[{i}] must be a number, or a function of omega and T, or of omega, T and t, to a number >= 0"
     try:
-        value = rate(*(1.0, 1.0, 0.0)[: 3 if _takes_time(rate) else 2])
+        value = rate(*(1.0, 1.0, 0.0)[: 3 if _rate_depends_on_time(rate) else 2])
     except TypeError as error:
         raise InputError(f"{what}: {error}") from None
     if np.shape(value) or jnp.result_type(value).kind not in "fiu":
@@ -471,7 +471,7 @@ def _checked_rate_function(rate: Callable, i: int) -> Callable:
     return rate
 
 
-def _takes_time(rate) -> bool:
+def _rate_depends_on_time(rate) -> bool:
     """Return whether a rate is a function of omega, T and the time."""
     return callable(rate) and required_argument_count(rate) == 3
 
@@ -486,7 +486,7 @@ def _jumps_of_coupling(
     V = np.asarray(operator)
     V_framed = adjoint(frame) @ V @ frame
     framed_hamiltonians = [adjoint(frame) @ subtract_common_energy(H) @ frame for H in hamiltonians]
-    tolerances = [level_gap_rounding(H) for H in hamiltonians]
+    tolerances = [level_gap_rounding_bound(H) for H in hamiltonians]
     entries = np.nonzero(np.abs(V_framed) > _entry_rounding_bounds(V_framed, frame, framed_hamiltonians, tolerances))
     gaps = np.stack([np.diag(H).real[entries[1]] - np.diag(H).real[entries[0]] for H in framed_hamiltonians])
     labels = np.stack(

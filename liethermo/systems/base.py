@@ -31,7 +31,7 @@ from .conservation import project_covector
 from .interface import SystemInterface
 from .invariants import candidate_invariants, find_invariants, find_preserved_function_names
 from .states import checked_state_array, evaluate_batch, reshape_to_sites
-from .transport import dissipation_velocities, generator_field, has_generator
+from .transport import added_attitude_velocities, generator_field, has_generator
 
 
 class System(SystemInterface):
@@ -126,7 +126,7 @@ class System(SystemInterface):
                     if term.acts_on_baths_alone
                     else f"{type(term).__name__} drives the entropy up, so the system needs an entropy"
                 )
-            if not term.can_drive_baths:
+            if not term.can_act_on_baths:
                 raise InputError(
                     f"{type(term).__name__} drives the entropy of the body up, which it needs beside the entropies of "
                     "its baths. Give entropy="
@@ -244,15 +244,15 @@ class System(SystemInterface):
         dH, dL = system.energy.gradient(x), tuple(L.gradient(x) for L in dissipation.preserve)
         return jax.jacfwd(lambda dS: dissipation.force(system, x, dH, dS, dL))(jnp.zeros(self.dim))
 
-    def driving_covector(self, x, dH, dS, dL=()) -> jax.Array:
-        """Return the covector, shape (body_dim,), that Pi maps to the velocity of the body without torques.
+    def attitude_velocity_from_gradients(self, x, dH, dS, dL=()) -> jax.Array:
+        """Return the velocity xi of an attitude, ``g' = g hat(xi)``, shape (body_dim,), from continuous or discrete
+        gradients.
 
-        It is dH plus the velocities of the dissipations [:meth:`liethermo.Dissipation.velocity`], for the body without
-        baths; the gradients are continuous or discrete. On a Lie algebra the attitude g obeys
-        ``g' = g hat(xi)``, where xi is this covector.
+        It is dH plus :meth:`liethermo.Dissipation.added_attitude_velocity` of each dissipation, for the body without
+        baths. Without external torques the motion of the body is ``Pi(x) xi``, except for internal momenta.
         """
         total = dH[: self.body_dim]
-        for sigma in dissipation_velocities(self, x, dH, dS, dL):
+        for sigma in added_attitude_velocities(self, x, dH, dS, dL):
             total = total if sigma is None else total + sigma
         return total
 

@@ -83,10 +83,13 @@ class EmbeddedSystem(System):
 
     @property
     def domain(self) -> Domain:
-        name, why_singular = _space_of(self.manifold_system).name, self.manifold_system.domain.why_singular
-        return Domain(f"a point of {name}", self._why_outside, why_singular)
+        name, why_entropy_gradient_infinite = (
+            _space_of(self.manifold_system).name,
+            self.manifold_system.domain.why_entropy_gradient_infinite,
+        )
+        return Domain(f"a point of {name}", self._why_outside_domain, why_entropy_gradient_infinite)
 
-    ledger = forward_to("manifold_system")
+    ledger_functions = forward_to("manifold_system")
 
     @property
     def wrapped_system(self) -> WrappedSystem:
@@ -96,7 +99,7 @@ class EmbeddedSystem(System):
     def constraint_surface(self) -> ConstraintSurface:
         return ConstraintSurface(_space_of(self.manifold_system), self.is_tangent)
 
-    def _why_outside(self, x) -> str:
+    def _why_outside_domain(self, x) -> str:
         space, x = _space_of(self.manifold_system), np.atleast_2d(x)
         if not np.isfinite(x).all():
             return ""
@@ -167,9 +170,9 @@ class _TangentDissipation(LiftedDissipation):
     def force(self, system, x, dH, dS, dL):
         return _tangent_force(self, x, dH, dS, dL)
 
-    def divergence(self, system, x):
+    def factor_divergence(self, system, x):
         """Return the divergence of the noise with respect to the volume of the manifold."""
-        return self.inner.divergence(self.manifold_system, system.constraint_surface.project_state(x))
+        return self.inner.factor_divergence(self.manifold_system, system.constraint_surface.project_state(x))
 
 
 @jit_subprogram
@@ -351,6 +354,8 @@ class _ChartDissipation(LiftedDissipation):
         point = _ChartPoint(self.system, self.coordinates, self.place, x)
         return LiftedGeometry(self.system, point.state, point.lift_covector, point.lower_velocity)
 
-    def divergence(self, system, x):
+    def factor_divergence(self, system, x):
         """Return the divergence of the noise with respect to the volume of the manifold."""
-        return self.inner.divergence(self.system, _ChartPoint(self.system, self.coordinates, self.place, x).state)
+        return self.inner.factor_divergence(
+            self.system, _ChartPoint(self.system, self.coordinates, self.place, x).state
+        )

@@ -19,7 +19,13 @@ from manifolds._pytree_module import Module
 from manifolds.matrices.linear import adjoint
 
 from ..dissipation.lindblad import LindbladJumps, OperatorFunction
-from ..dissipation.operators import HasMatrix, Operator, checked_hermitian, checked_square_matrix, level_gap_rounding
+from ..dissipation.operators import (
+    HasMatrix,
+    Operator,
+    checked_hermitian,
+    checked_square_matrix,
+    level_gap_rounding_bound,
+)
 from ..dissipation.quantum import cluster_labels
 from ..errors import InputError
 from ..functions.bath_energy import BathEnergy, ReservoirEnergy
@@ -415,7 +421,7 @@ class RotatingFrame(metaclass=ListedType):
 
     @property
     def _tolerance(self) -> float:
-        return len(self.levels) * level_gap_rounding(self.generator)
+        return len(self.levels) * level_gap_rounding_bound(self.generator)
 
     def _check_size(self, shape: tuple[int, ...], what: str) -> None:
         if shape != self.generator.shape:

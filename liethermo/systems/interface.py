@@ -16,7 +16,7 @@ import scipy
 
 from ..dissipation.base import ABSENT_DISSIPATION, Dissipation, LawName
 from ..dissipation.geometry import Geometry
-from ..errors import InputError
+from ..errors import InputError, refuse_replaced_members
 from ..functions.energy import Energy
 from ..functions.surface import Surface
 from .attitude_layout import AttitudeLayout
@@ -195,9 +195,10 @@ REPLACED_MEMBERS = {
     "freeze_at": "cache_tensors_at",
     "surface": "constraint_surface",
     "solve_at_spins": "solve_slopes_at_each_spin",
-    "transport": "driving_covector",
+    "transport": "attitude_velocity_from_gradients",
     "energy_of_vectors": "energy_of_flat_states",
     "inner": "inner_system",
+    "ledger": "ledger_functions",
 }
 """Names of members that kinds of systems used to override, and of those that replace them."""
 
@@ -210,9 +211,7 @@ class SystemInterface(Geometry):
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
-        for name, replacement in REPLACED_MEMBERS.items():
-            if name in cls.__dict__:
-                raise TypeError(f"{cls.__name__} defines {name}, which nothing calls. Override {replacement}")
+        refuse_replaced_members(cls, REPLACED_MEMBERS)
 
     entropy: Energy | None
     dissipation: Dissipation | None
@@ -413,7 +412,7 @@ class SystemInterface(Geometry):
         return None
 
     @property
-    def ledger(self) -> dict[str, Energy]:
+    def ledger_functions(self) -> dict[str, Energy]:
         """Functions of a state, by name, that give the work and the heat received from outside along a run."""
         return {}
 

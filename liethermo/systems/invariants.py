@@ -52,10 +52,10 @@ def candidate_invariants(system: SystemInterface) -> dict[str, Energy]:
 
 def preserved_function_names(system: SystemInterface) -> tuple[str, ...]:
     """Return the names of the preserved functions of a system, those of :func:`candidate_invariants`."""
-    return tuple(number_preserved_functions(system)) if system.preserved_labels is None else system.preserved_labels
+    return tuple(preserved_functions_by_number(system)) if system.preserved_labels is None else system.preserved_labels
 
 
-def number_preserved_functions(system: SystemInterface) -> dict[str, Energy]:
+def preserved_functions_by_number(system: SystemInterface) -> dict[str, Energy]:
     """Return the preserved functions of a system by the names "preserved 1", "preserved 2" and so on."""
     return {f"preserved {i + 1}": L for i, L in enumerate(system.preserved_functions)}
 
@@ -85,7 +85,7 @@ def name_preserved_functions(system: SystemInterface, multiple_indices: Sequence
     """
     names, reserved_names = list(system.momentum_maps | system.casimirs()), {"energy", "entropy"}
     n_named = len(names)
-    for multiple, (fallback, L) in zip(multiple_indices, number_preserved_functions(system).items(), strict=True):
+    for multiple, (fallback, L) in zip(multiple_indices, preserved_functions_by_number(system).items(), strict=True):
         name = function_name(L)
         usable = name.isidentifier() and name not in {*names, *reserved_names}
         names.append(names[multiple] if multiple >= 0 else name if usable else fallback)

@@ -130,7 +130,7 @@ class LedgerSystem(System):
         return jnp.stack([power, heat_power, jnp.ones(())])[: self.dim - self.dim_without_ledger]
 
     @property
-    def ledger(self) -> dict[str, Energy]:
+    def ledger_functions(self) -> dict[str, Energy]:
         names = ("work received", "heat received") if self.has_ledger else ()
         rows = jnp.eye(self.dim)
         return {name: Quadratic(jnp.zeros(self.dim), rows[self.dim_without_ledger + i]) for i, name in enumerate(names)}
@@ -198,9 +198,9 @@ class LedgerSystem(System):
 
     @property
     def domain(self) -> Domain:
-        return Domain("a positive temperature", self._why_outside, margin=self.temperature)
+        return Domain("a positive temperature", self._why_outside_domain, margin=self.temperature)
 
-    def _why_outside(self, x) -> str:
+    def _why_outside_domain(self, x) -> str:
         T = float(evaluate_at_points(_temperature, self, np.atleast_2d(x)).min())
         return "" if T > 0.0 else f"the temperature -dL/dS is {T:.4g}: it has to be positive"
 

@@ -111,7 +111,7 @@ def _poisson_tensor(system: System, x) -> jax.Array:
     return jax.jacfwd(lambda alpha: system.poisson.sharp(x, alpha))(jnp.zeros(system.dim))
 
 
-def heat_counter_indices(system: System) -> np.ndarray:
+def constant_temperature_entropy_indices(system: System) -> np.ndarray:
     """Return the indices, shape (k,), of the entropies of baths of constant temperature, which only count heat.
 
     The motion of the other components does not depend on them, so they may grow in a steady state.
@@ -182,7 +182,7 @@ def conserved_functions(system: System, x) -> dict[str, Energy]:
             conserved_by_name.update(components.get(name, {name: g}))
     if system.energy_law == "conserved" and not system.torque_laws.name:
         conserved_by_name["energy"] = system.energy
-    counter_indices = heat_counter_indices(system)
+    counter_indices = constant_temperature_entropy_indices(system)
     if not counter_indices.size or not conserved_by_name:
         return conserved_by_name
     gradients = evaluate_at_points(stack_gradients, tuple(conserved_by_name.values()), np.atleast_2d(np.asarray(x)))
@@ -392,7 +392,7 @@ def linearise(system: System, x, t: float | None = None) -> Linearisation:
     derivatives, functions = field_derivatives_and_invariants(system, x)
     size = float(np.linalg.norm(x))
     limit = REST_RTOL * np.linalg.norm(derivatives.jacobian) * (size or 1.0)
-    velocity = np.delete(derivatives.velocity, heat_counter_indices(system))
+    velocity = np.delete(derivatives.velocity, constant_temperature_entropy_indices(system))
     if not np.linalg.norm(velocity) <= limit:
         raise InputError(
             f"x is not an equilibrium: the vector field there has the norm {np.linalg.norm(velocity):.3g}. Find one "
@@ -412,7 +412,7 @@ def linearise_at(
     system: System, x: np.ndarray, derivatives: FieldDerivatives, functions: dict[str, Energy], scale: float
 ) -> Linearisation:
     """Return the linear motion near an equilibrium x of a frozen system, from derivatives computed there."""
-    counter_indices = heat_counter_indices(system)
+    counter_indices = constant_temperature_entropy_indices(system)
     frame = derivatives.frame
     n = frame.shape[1]
     body = np.delete(np.arange(len(frame)), counter_indices) if counter_indices.size else np.arange(len(frame))

@@ -18,7 +18,7 @@ from manifolds.matrices.linear import adjoint
 from ..dissipation.adiabatic import ADIABATIC_LIMIT, AdiabaticJumps, adiabatic_parameter
 from ..dissipation.base import Dissipation, dissipation_terms
 from ..dissipation.lindblad import LindbladJumps
-from ..dissipation.operators import HasMatrix, checked_hermitian, level_gap_rounding
+from ..dissipation.operators import HasMatrix, checked_hermitian, level_gap_rounding_bound
 from ..dissipation.quantum import ThermalJumps
 from ..dissipation.steepest_ascent import SteepestEntropyAscent
 from ..errors import InputError
@@ -305,9 +305,11 @@ class QuantumSystem(System):
 
     @property
     def domain(self) -> Domain:
-        return Domain(why_outside=self._why_outside, why_singular=self._why_singular)
+        return Domain(
+            why_outside=self._why_outside_domain, why_entropy_gradient_infinite=self._why_entropy_gradient_infinite
+        )
 
-    def _why_outside(self, x) -> str:
+    def _why_outside_domain(self, x) -> str:
         """Return why states are outside of the cone of density matrices, as a text; "" if all are inside."""
         if is_traced(self):
             return ""
@@ -373,7 +375,7 @@ class QuantumSystem(System):
         p = np.linalg.eigvalsh(rho)
         smallest_positive = p[p > self._zero_eigenvalue_limit].min()
         return any(
-            np.abs(complement @ H @ kernel).max() > level_gap_rounding(H) / smallest_positive
+            np.abs(complement @ H @ kernel).max() > level_gap_rounding_bound(H) / smallest_positive
             for H in self.hamiltonians_at_test_times()
         )
 
@@ -388,7 +390,7 @@ class QuantumSystem(System):
         affinity = np.asarray(self.structure.matrix(ascent.ascent_direction(self, x, self.energy.gradient(x), dS, dL)))
         return float(np.exp(np.linalg.eigvalsh(adjoint(kernel) @ affinity @ kernel)[-1] - 1.0))
 
-    def _why_singular(self, x) -> str:
+    def _why_entropy_gradient_infinite(self, x) -> str:
         """Return why the gradient of the entropy is infinite at states, as a text; "" if it is finite."""
         if is_traced(self) or not self._has_dissipation(ThermalJumps):
             return ""

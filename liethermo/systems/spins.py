@@ -280,10 +280,10 @@ class _HeatingSpins(HeatingSites):
         super().__init__(shape)
         self._spins = spins
 
-    def _scale_each(self, values, v) -> jax.Array:
+    def _scale_each_site(self, values, v) -> jax.Array:
         return self._spins.join_state(scale_vectors(values, self._spins.split_covectors(v)), jnp.zeros(0))
 
-    def dot(self, alpha, v) -> jax.Array:
+    def dot_at_sites(self, alpha, v) -> jax.Array:
         return dot_vectors(self._spins.split_covectors(alpha), self._spins.split_covectors(v))
 
 

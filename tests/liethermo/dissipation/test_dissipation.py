@@ -7,6 +7,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
+from liethermo.dissipation.base import REPLACED_MEMBERS
 from tests.cases import (
     ALGEBRAS,
     DISSIPATIONS,
@@ -277,6 +278,17 @@ def test_invalid_lists_of_dissipations(argument, words):
 
 
 # -- controls: what must fail -------------------------------------------------------------------------------------
+
+
+def test_a_dissipation_that_overrides_a_member_by_its_former_name_is_refused():
+    """An override by the former name would have no effect."""
+    assert REPLACED_MEMBERS["velocity"] == "added_attitude_velocity"
+    for name, replacement in REPLACED_MEMBERS.items():
+        assert hasattr(lt.Dissipation, replacement)
+        assert not hasattr(lt.Dissipation, name)
+        with pytest.raises(TypeError, match=rf"^Earlier defines {name}, which nothing calls\. Override {replacement}$"):
+            type("Earlier", (lt.Friction,), {name: None})
+        type("Present", (lt.Friction,), {replacement: getattr(lt.Friction, replacement)})
 
 
 class WrongEnergy(lt.Dissipation):
