@@ -51,7 +51,7 @@ class InstantaneousJumps(NamedTuple):
 
 
 class AdiabaticJumps(ThermalJumps):
-    """Jumps between the levels of the moment, for a slow drive that turns eigenvectors [Albash et al. 2012].
+    """Jumps between instantaneous energy levels, for a slow drive that turns eigenvectors [Albash et al. 2012].
 
     The jumps are those of :class:`ThermalJumps` for the Hamiltonian H(t) of each time: a coupling V is split into
     components with ``[H(t), V_omega(t)] = -omega(t) V_omega(t)``, which a bath of the temperature T drives at the rates
@@ -116,10 +116,10 @@ class AdiabaticJumps(ThermalJumps):
         else:
             hamiltonians = system.hamiltonians_at_test_times()
             groups = _group_numbers_of_level_pairs(hamiltonians)
-            self._check_rates_at_zero(hamiltonians)
+            self._check_rates_at_zero_frequency(hamiltonians)
         return replace_fields(self, pair_groups=Indices(groups))
 
-    def _check_rates_at_zero(self, hamiltonians: list[np.ndarray]) -> None:
+    def _check_rates_at_zero_frequency(self, hamiltonians: list[np.ndarray]) -> None:
         """Raise InputError if a rate is infinite at omega = 0, and the coupling has a component of this frequency."""
         for i, (operator, rate) in enumerate(zip(self.operators, self.rates, strict=True)):
             if not callable(rate) or is_traced(rate):

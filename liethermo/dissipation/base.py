@@ -205,7 +205,7 @@ class Dissipation(Module):
         return jnp.zeros(B.size) if B.solenoidal else jnp.sum(self.factor_divergence_terms(system, x), axis=0)
 
     def factor_divergence_terms(self, system: Geometry, x) -> jax.Array:
-        """Return the terms, shape (n, columns), whose sum over the first axis is the divergence of each column."""
+        """Return the terms, shape (n, columns), whose sum over the first axis is :meth:`factor_divergence`."""
 
         def contract_columns(y, alpha) -> jax.Array:
             B = self.factor_at_state(system, y)

@@ -40,7 +40,7 @@ def repeat_over_sites(form, system: Geometry):
 
 
 def state_shape_dtype(dim: int):
-    """Return the abstract value of a state of this dimension."""
+    """Return the shape and dtype of a state of a dimension, for abstract evaluation by JAX."""
     return jax.ShapeDtypeStruct((dim,), jnp.float64)
 
 
@@ -59,7 +59,7 @@ def checked_rates(rates) -> jax.Array:
 
 
 def checked_bath_indices(bath) -> Indices | None:
-    """Return the number of a bath, or one for each site; the system later checks that the baths exist."""
+    """Return the index of a bath, or one for each site, as checked integers; the system checks that the baths exist."""
     if bath is None or isinstance(bath, Indices):
         return bath
     numbers = np.asarray(bath)

@@ -1,4 +1,4 @@
-"""The geometry of a system, as dissipations use it."""
+"""Interface of systems to their dissipations: structure, metric of the space, sites, and isotropic noise."""
 
 from __future__ import annotations
 

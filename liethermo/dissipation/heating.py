@@ -85,7 +85,7 @@ class Heating(LiftedDissipation):
         )
 
     def factor_divergence(self, system, x):
-        """Return the divergence of each column of B, ``sqrt(T) div B0 + T' B0^T dH / (2 T^3/2)``, T' = dT/dy."""
+        """Return the divergence of each column of B: ``sqrt(T) div B0 + T' B0^T dH / (2 T^3/2)``, T' = dT/dy."""
         body, n = system.drop_baths(), system.body_dim
         dH, dL = system.energy.gradient(x), tuple(L.gradient(x) for L in self.preserve)
         B = self.inner.factor(body, x[:n], dH[:n], tuple(L[:n] for L in dL))
@@ -125,7 +125,7 @@ class Heating(LiftedDissipation):
         return jnp.where(np.arange(len(T)) == int(np.asarray(self.bath)), energy_loss / T, 0.0)
 
     def _effective_energy_gradient(self, body: Geometry, dH, dS, body_dim: int) -> jax.Array:
-        """Return the gradient that replaces dH in the force on the body, shape (n,): dH for the bath entropy."""
+        """Return the gradient that replaces dH in the force on the body, shape (n,); dH if S is the bath entropy."""
         T, dS_y, sign = (
             self.bath_values_at_sites(dH[body_dim:]),
             self.bath_values_at_sites(dS[body_dim:]),
@@ -255,11 +255,11 @@ class BathConduction(HeatConduction):
 
     def bind_to(self, system):
         n_baths = system.baths.number
-        last = int(np.max(np.asarray(self.second_bodies), initial=0))
-        if last >= n_baths:
+        last_bath = int(np.max(np.asarray(self.second_bodies), initial=0))
+        if last_bath >= n_baths:
             raise InputError(
-                f"BathConduction joins bath {last}, but there are {n_baths} baths, numbered from 0. Give the system "
-                f"baths=lt.HeatBaths(..., number={last + 1})"
+                f"BathConduction joins bath {last_bath}, but there are {n_baths} baths, numbered from 0. Give the "
+                f"system baths=lt.HeatBaths(..., number={last_bath + 1})"
             )
         return self
 
@@ -267,19 +267,19 @@ class BathConduction(HeatConduction):
         return np.arange(system.body_dim, system.dim)
 
     def entropy_rates(self, T, dS) -> jax.Array:
-        """Return the growth rates of the entropies of all baths.
+        """Return the growth rates of the entropies of all baths, shape (number,), by conduction.
 
         Parameters
         ----------
         T, dS : array, shape (number,)
             Temperatures of the baths, and the gradient of the entropy by theirs.
         """
-        first, second = self.edge_entropy_rates(T, T, dS, T)
+        first_rates, second_rates = self.edge_entropy_rates(T, T, dS, T)
         i, j = np.asarray(self.first_bodies), np.asarray(self.second_bodies)
-        return jnp.zeros_like(T).at[i].add(first).at[j].add(second)
+        return jnp.zeros_like(T).at[i].add(first_rates).at[j].add(second_rates)
 
     def factor_divergence(self, system, x):
-        """Return the divergence of each column of B.
+        """Return the divergence of each column of the factor B, shape (edges,).
 
         It is ``sqrt(G T_i / T_j) T_j' / (2 T_j) - sqrt(G T_j / T_i) T_i' / (2 T_i)``.
 

@@ -60,7 +60,7 @@ def terms_with_factors_at_state(dissipation: Dissipation, system: Geometry, x) -
 
 
 def factor_check_residuals(dissipation: Dissipation, system: Geometry, x) -> dict[str, jax.Array]:
-    """Return, by name, how far the factors miss each of their properties at x, relative to the terms that cancel."""
+    """Return the relative residuals at x, by name, of the properties that the factors must have."""
     dH = system.energy.gradient(x)
     (generic,) = generic_covectors(x.shape[0], 1)
     residuals: dict[str, list[jax.Array]] = {

@@ -191,7 +191,7 @@ class ThermalJumps(Dissipation):
         return structure
 
     def replace_operators(self, matrices: Sequence[Any], bath: int) -> ThermalJumps:
-        """Return jumps with these matrices, for example of a larger system, another bath, and unchanged rates."""
+        """Return jumps with other operators, such as those of a larger system, another bath and unchanged rates."""
         return replace_fields(self, operators=tuple(map(Operator, matrices)), bath=bath, jumps=())
 
     def force(self, system, x, dH, dS, dL):
@@ -479,9 +479,10 @@ def _rate_depends_on_time(rate) -> bool:
 def _jumps_of_coupling(
     operator: Operator, coupling_index: int, hamiltonians: Sequence[np.ndarray], frame: np.ndarray
 ) -> list[Jump]:
-    """Return the jumps of a coupling: its eigenoperators of ``[H, .]``, if Hermitian one of each adjoint pair.
+    """Return the jumps of a coupling, the eigenoperators of ``[H, .]`` whose sum it is.
 
-    The entries of an eigenoperator have the same difference of levels, in the frame, under each of the Hamiltonians.
+    Of a Hermitian coupling one eigenoperator of each adjoint pair is returned. The entries of one have the same
+    difference of levels, in the frame, under each of the Hamiltonians.
     """
     V = np.asarray(operator)
     V_framed = adjoint(frame) @ V @ frame
@@ -522,7 +523,7 @@ def _jumps_of_coupling(
 def _entry_rounding_bounds(
     V_framed: np.ndarray, frame: np.ndarray, framed_hamiltonians: Sequence[np.ndarray], tolerances: Sequence[float]
 ) -> np.ndarray | float:
-    """Return the bound, shape (N, N), below which entries of a matrix in the frame may be rounding; 0 for the axes.
+    """Return bounds, shape (N, N), of the rounding errors of the entries of a matrix in a frame; 0 if it is diagonal.
 
     An eigenvector contains another one by the rounding of the energies, relative to their difference.
     """
@@ -539,7 +540,7 @@ def _entry_rounding_bounds(
 
 
 def cluster_labels(numbers: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return the cluster of each number; a new cluster begins more than ``tolerance`` above the start of the last."""
+    """Return the label of the cluster of each number; numbers of a cluster differ by at most ``tolerance``."""
     labels, cluster_start, label = np.empty(len(numbers), int), -np.inf, -1
     for i in np.argsort(numbers):
         if numbers[i] > cluster_start + tolerance:

@@ -113,9 +113,9 @@ def judge_conservation(rates: InvariantRates, tolerance: float = AXIOM_TOLERANCE
     """
     values, scales = rates
     with np.errstate(invalid="ignore"):
-        each_vanishes = (abs(values) <= tolerance * scales).all(axis=-2)
+        all_parts_vanish = (abs(values) <= tolerance * scales).all(axis=-2)
         sum_vanishes = abs(values.sum(axis=-2)) <= tolerance * abs(values).max(axis=-2)
-    return PointwiseVerdicts((abs(values) < np.inf).all(axis=-2), each_vanishes | sum_vanishes)
+    return PointwiseVerdicts((abs(values) < np.inf).all(axis=-2), all_parts_vanish | sum_vanishes)
 
 
 def is_proportional(f: np.ndarray, g: np.ndarray) -> np.ndarray:

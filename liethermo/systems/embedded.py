@@ -77,6 +77,7 @@ class EmbeddedSystem(System):
         )
 
     def _mark_polynomial_degrees(self, energy: Energy) -> Energy:
+        """Return an energy with the degree set in each function that is a polynomial of the components of a state."""
         return with_polynomial_degrees(energy, self.dim)
 
     kind = forward_to("manifold_system")

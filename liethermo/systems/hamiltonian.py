@@ -353,13 +353,13 @@ class RotatingFrame(metaclass=ListedType):
         """
         V = checked_square_matrix(operator, "the operator")
         self._check_size(V.shape, "the operator")
-        inside = adjoint(self.vectors) @ V @ self.vectors
+        V_in_eigenbasis = adjoint(self.vectors) @ V @ self.vectors
         gaps = self.levels[None, :] - self.levels[:, None]
         labels = cluster_labels(gaps.ravel(), self._tolerance).reshape(gaps.shape)
         rounding = 1e-13 * np.abs(V).max()
         parts = {}
         for label in range(labels.max() + 1):
-            part = np.where(labels == label, inside, 0.0)
+            part = np.where(labels == label, V_in_eigenbasis, 0.0)
             if np.abs(part).max() > rounding:
                 parts[float(gaps[labels == label].mean())] = self.vectors @ part @ adjoint(self.vectors)
         return parts

@@ -60,8 +60,8 @@ class LedgerSystem(System):
         def check(function, result_shape, what):
             if function is None:
                 return None
-            checked = checked_state_function(function, argument_shapes, result_shape, what, arguments_text)
-            return checked if len(shape) == 1 else FlattenedFunction(checked, shape)
+            checked_function = checked_state_function(function, argument_shapes, result_shape, what, arguments_text)
+            return checked_function if len(shape) == 1 else FlattenedFunction(checked_function, shape)
 
         if friction is None or callable(friction):
             self.friction = check(friction, shape, "friction")

@@ -151,9 +151,11 @@ def freeze_system(system: System, t: float | None) -> System:
 
 
 def _describe_time_dependent_part(system: System) -> str:
-    """Return a clause that says which part of a driven system depends on time; "" if none does at the test times."""
+    """Return a clause for a message that names the part of a driven system that depends on time; "" if none does."""
     points = system.samples(3)
-    velocities = np.stack([evaluate_at_points(_velocity, s, points) for s in systems_at_test_times(system)])
+    velocities = np.stack(
+        [evaluate_at_points(_vector_field_at_state, s, points) for s in systems_at_test_times(system)]
+    )
     scale = np.abs(velocities).max()
     if np.abs(velocities - velocities[0]).max() <= EPS * 64 * scale:
         return ""
@@ -163,7 +165,7 @@ def _describe_time_dependent_part(system: System) -> str:
     return f"{what} of this {system.kind} depends on time"
 
 
-def _velocity(system: System, x) -> jax.Array:
+def _vector_field_at_state(system: System, x) -> jax.Array:
     """Return the vector field at one state, shape (n,)."""
     return system._vector_field(x)
 
@@ -459,9 +461,9 @@ def evaluate_functions(functions: Sequence[Energy], states: np.ndarray) -> np.nd
     """Return the values of functions at states, shape (m, n), as an array, shape (m, functions)."""
     if not functions:
         return np.zeros((len(states), 0))
-    return evaluate_at_points(_values, tuple(functions), states)
+    return evaluate_at_points(_values_at_state, tuple(functions), states)
 
 
-def _values(functions: tuple[Energy, ...], x) -> jax.Array:
+def _values_at_state(functions: tuple[Energy, ...], x) -> jax.Array:
     """Return the values of functions at one state, shape (functions,)."""
     return jnp.stack([g.value(x) for g in functions])

@@ -1,4 +1,4 @@
-"""Convert states: check what users give, evaluate functions at batches of states, and give states their shape."""
+"""Conversions of states: checks of those that users give, evaluation at batches of states, and shapes of lattices."""
 
 from __future__ import annotations
 
@@ -123,5 +123,5 @@ def reshape_to_sites(system: Any, solution: Any) -> Any:
     if not system.sites:
         return solution
     states = {name: value for name in solution.state_fields if (value := getattr(solution, name)) is not None}
-    reshaped = {name: value.reshape(*value.shape[:-1], *system.shape) for name, value in states.items()}
-    return dataclasses.replace(solution, **reshaped)
+    reshaped_states = {name: value.reshape(*value.shape[:-1], *system.shape) for name, value in states.items()}
+    return dataclasses.replace(solution, **reshaped_states)
