@@ -191,7 +191,7 @@ class ThermalJumps(Dissipation):
         return structure
 
     def replace_operators(self, matrices: Sequence[Any], bath: int) -> ThermalJumps:
-        """Return jumps with other operators, such as those of a larger system, another bath and unchanged rates."""
+        """Return jumps with other matrices, such as those of a larger system, another bath and unchanged rates."""
         return replace_fields(self, operators=tuple(map(Operator, matrices)), bath=bath, jumps=())
 
     def force(self, system, x, dH, dS, dL):
@@ -481,8 +481,8 @@ def _jumps_of_coupling(
 ) -> list[Jump]:
     """Return the jumps of a coupling, the eigenoperators of ``[H, .]`` whose sum it is.
 
-    Of a Hermitian coupling one eigenoperator of each adjoint pair is returned. The entries of one have the same
-    difference of levels, in the frame, under each of the Hamiltonians.
+    If the coupling is Hermitian, one eigenoperator of each adjoint pair is returned. The entries of an eigenoperator
+    have the same difference of levels, in the frame, under each of the Hamiltonians.
     """
     V = np.asarray(operator)
     V_framed = adjoint(frame) @ V @ frame
