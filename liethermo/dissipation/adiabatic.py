@@ -142,14 +142,16 @@ class AdiabaticJumps(ThermalJumps):
         structure, n = system.structure, system.body_dim
         T = dH[n + self.bath]
         levels, vectors, V, omega, rates = self._jumps_at(system, dH, T)
-        # in the basis of the system, as in dS: in another the logarithms of eigenvalues near zero are others
+        # in the basis of the system, as dS: the logarithms of eigenvalues near zero are rounded differently in another
         logs = matrix_logarithm(structure.matrix(x[:n]))
         rho, A, logs = (adjoint(vectors) @ a @ vectors for a in (*map(structure.matrix, (x[:n], dS[:n])), logs))
         gaps = levels[None, :] - levels[:, None]
         bath_terms = (dS[n + self.bath] * V * gaps - omega[:, None, None] * V) / T
         image = apply_jump_friction(rho, logs, A, V, omega / (2.0 * T), bath_terms)
         drho = jnp.sum(commutator(adjoint(V), image * rates[:, None, None]), axis=0)
-        return self._force_with_bath_entropy_rates(system, T, levels, vectors, drho)  # the adjoints add the adjoint
+        return self._force_with_bath_entropy_rates(
+            system, T, levels, vectors, drho
+        )  # jumps by adjoint operators add the adjoint
 
     def generator_field(self, system, x, dH):
         """Return the force as Lindblad's equation, without a logarithm, followed by the bath entropy rates."""

@@ -174,7 +174,7 @@ class Dissipation(Module):
         It is the force for the exact gradients, and exists if :attr:`has_generator` is True. Lindblad's equation is a
         generator: it needs no logarithm of the density matrix.
         """
-        raise NotImplementedError(f"{type(self).__name__} has no such form")
+        raise NotImplementedError(f"{type(self).__name__} has no generator")
 
     def added_attitude_velocity(self, system: Geometry, x, dH, dS, dL) -> jax.Array | None:
         """Return the velocity sigma, shape (n,), that the force adds to that of an attitude; None for other forces.

@@ -182,7 +182,7 @@ class LocalProjectedMetric(Dissipation):
     def bind_to(self, system):
         if system.space is not None:
             raise InputError(
-                "LocalProjectedMetric needs a system on copies of an algebra, and this one is on a manifold"
+                "LocalProjectedMetric needs a system on copies of an algebra, but this one is on a manifold"
             )
         if self.rate.shape not in ((), system.sites):
             raise InputError(

@@ -222,7 +222,7 @@ class ThermalJumps(Dissipation):
         drho = jnp.sum(
             commutator(V_adjoint, image * self._weighted_jump_rates(system, omega, T)[:, None, None]), axis=0
         )
-        return self._append_bath_entropy_rates(system, dH, T, drho)  # the adjoints add the adjoint
+        return self._append_bath_entropy_rates(system, dH, T, drho)  # jumps by adjoint operators add the adjoint
 
     has_generator = True
 
@@ -256,7 +256,7 @@ class ThermalJumps(Dissipation):
                 arguments = (omega, T, 0.0)[: 3 if jump.coupling_index in self.timed_rates else 2]
                 strength = jump.weight * np.asarray(rate(*arguments) if callable(rate) else rate, dtype=np.float64)
                 exact_rate = float(strength * np.exp(np.float64(w) / (2.0 * T)))
-            # the exponential is to blame, not the rate
+            # the exponential overflows, not the rate
             if w > -2.0 * np.log(EPS) * T and not exact_rate * EPS <= w:
                 raise InputError(
                     f"jumps of V[{jump.coupling_index}] with the energy {w:.3g} have, at T = {T:.3g}, "

@@ -124,12 +124,12 @@ class System(SystemInterface):
                 raise InputError(
                     f"{type(term).__name__} acts on baths. Give the system baths=lt.HeatBaths(...)"
                     if term.acts_on_baths_alone
-                    else f"{type(term).__name__} drives the entropy up, so the system needs an entropy"
+                    else f"{type(term).__name__} increases the entropy, so the system needs one. Give entropy="
                 )
             if not term.can_act_on_baths:
                 raise InputError(
-                    f"{type(term).__name__} drives the entropy of the body up, which it needs beside the entropies of "
-                    "its baths. Give entropy="
+                    f"{type(term).__name__} increases the entropy of the body, which has none besides the entropies "
+                    "of its baths. Give entropy="
                 )
         self.dissipation = None
         if dissipation is not None:

@@ -273,7 +273,7 @@ def steady_state(system: System, x0=None, t: float | None = None) -> Equilibrium
     if not len(states):
         raise ConvergenceError(
             f"the motion of this {system.kind} from x0 does not come to rest: it may oscillate, grow, or have no "
-            "steady state. Give another x0, or look for unstable ones with lt.equilibria(system)",
+            "steady state. Give another x0, or look for unstable equilibria with lt.equilibria(system)",
             None,
         )
     return _make_equilibrium(system, states[0], scale)

@@ -157,7 +157,7 @@ class LiePoissonSystem(TorqueSystem):
         )
         if "rotor_rates" not in parts:
             return quantities
-        rotors = parts["rotor_rates"]  # their momenta cancel that of the body in a momentum of the whole near zero
+        rotors = parts["rotor_rates"]  # if the total momentum is near zero, those of body and rotors cancel
         return quantities._replace(momentum_scale=lambda x: jnp.max(jnp.abs(x[rotors])))
 
     def state(

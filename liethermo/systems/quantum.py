@@ -578,7 +578,8 @@ class QuantumSystem(System):
             offset += s.dim - s.body_dim
         if (self.baths.number == 0) != (other.baths.number == 0) and all(s.total_dissipation.terms for s in systems):
             raise InputError(
-                "the jumps of one part have a bath, but those of the other none. Give baths to both parts or to neither"
+                "the jumps of one part have a bath, but those of the other part have none. "
+                "Give baths to both parts or to neither"
             )
         H = [s._constant_hamiltonian() for s in systems]
         total_H = tensor_with_identity(H[0], 0, sizes) + tensor_with_identity(H[1], 1, sizes)
@@ -593,8 +594,8 @@ class QuantumSystem(System):
         interaction = checked_hermitian(interaction, "the interaction")
         if interaction.shape != (self.structure.size,) * 2:
             raise InputError(
-                f"the interaction has shape {interaction.shape}, and the Hamiltonian ({self.structure.size}, "
-                f"{self.structure.size})"
+                f"the interaction must have the shape of the Hamiltonian, ({self.structure.size}, "
+                f"{self.structure.size}), got {interaction.shape}"
             )
         terms = self.total_dissipation.terms
         H = self._constant_hamiltonian() + interaction
@@ -603,7 +604,7 @@ class QuantumSystem(System):
     def _constant_hamiltonian(self) -> np.ndarray:
         """Return the Hamiltonian, shape (N, N); InputError if it depends on time."""
         if self.is_driven:
-            raise InputError("products and couplings are of systems whose Hamiltonian does not depend on time")
+            raise InputError("products and interactions need a Hamiltonian that does not depend on time")
         return self.hamiltonians_at_test_times()[0]
 
 

@@ -337,7 +337,7 @@ def _checked_powers(power, baths: HeatBaths) -> tuple[tuple[int, ...], tuple[Cal
     if power is None:
         return (), ()
     if not baths.number:
-        raise InputError("power= heats baths, and there are none. Give baths=lt.HeatBaths(...)")
+        raise InputError("power= heats baths, but this system has none. Give baths=lt.HeatBaths(...)")
     entries = list(power) if isinstance(power, list | tuple) else [power, *[None] * (baths.number - 1)]
     if len(entries) != baths.number:
         raise InputError(f"power must have {baths.number} entries, one per bath, got {len(entries)}")

@@ -99,7 +99,9 @@ def checked_times(system: Any, t) -> jax.Array | None:
     if not system.is_driven:
         return None
     if t is None:
-        what = "energy of this system depends on" if system.energy.depends_on_time else "torque is known at a"
+        what = (
+            "energy of this system depends on" if system.energy.depends_on_time else "torque of this system depends on"
+        )
         raise InputError(f"the {what} time. Give the time beside the state")
     return jnp.asarray(t, dtype=jnp.float64)
 

@@ -55,7 +55,7 @@ class Subsystem(Module):
         elif isinstance(species, bool) or not isinstance(species, int) or species < 0 or dim != 1 + species:
             raise InputError(
                 f"{name or 'a subsystem'} holds {species!r} kinds of particles, so its state is (S, N) of dim 1 + "
-                f"species, got dim {dim!r}. Make a wall that moves a body of its own"
+                f"species, got dim {dim!r}. Model a moving wall as a body of its own"
             )
         self.dim, self.name = dim, name
         energy = Quadratic(jnp.zeros(dim)) if energy is None else make_energy(energy, "the energy of a subsystem")

@@ -265,7 +265,7 @@ def test_a_list_of_dissipations_is_their_sum(parts):
         ([lt.DoubleBracket(0.1), None], r"dissipation\[1\] must be a Dissipation of this library, got NoneType"),
         ([[lt.DoubleBracket(0.1)]], r"dissipation\[0\] must be a Dissipation of this library, got list"),
         ("friction", "a list of them or None, got str"),
-        ([lt.DoubleBracket(0.1), lt.KillingDissipation(0.1)], "KillingDissipation drives the entropy up"),
+        ([lt.DoubleBracket(0.1), lt.KillingDissipation(0.1)], "KillingDissipation increases the entropy"),
     ],
 )
 def test_invalid_lists_of_dissipations(argument, words):
@@ -481,7 +481,9 @@ def test_a_dissipation_that_extends_another_stays_what_it_is():
 
 @pytest.mark.parametrize("kind", [lt.ProjectedMetric, lt.Friction, lt.FrictionOperator])
 def test_a_rate_in_place_of_a_matrix_is_rejected(kind):
-    with pytest.raises(lt.InputError, match=f"^{kind.__name__} takes .* and 0.3 is a number: for a rate say rate=0.3$"):
+    with pytest.raises(
+        lt.InputError, match=f"^{kind.__name__} takes .*, got the number 0.3. For a rate give rate=0.3$"
+    ):
         kind(0.3)
     assert float(kind(np.eye(3), rate=0.3).rate) == 0.3
 

@@ -141,7 +141,10 @@ test_refusals = refusal_test(
     (lambda: system(lt.LocalProjectedMetric(np.ones(6))), r"the shape \(3, 2\) of the sites, got \(6,\)"),
     (lambda: lt.LocalProjectedMetric([1.0, -1.0]), "must be >= 0, got -1"),
     (lambda: system(lt.LocalProjectedMetric(1.0, np.eye(4))), r"shape \(3, 3\), got \(4, 4\)"),
-    (lambda: system(lt.InnerProductDissipation(np.eye(4))), r"\(4, 4\), but \(so\(3\)\)\^3x2 has dimension 18"),
+    (
+        lambda: system(lt.InnerProductDissipation(np.eye(4))),
+        r"must have shape \(18, 18\) on \(so\(3\)\)\^3x2, got \(4, 4\)",
+    ),
     (lambda: system(lt.EulerPoincareForce(lambda xi: xi[0])), r"force F must have shape \(3, 2, 3\), got \(2, 3\)"),
     (lambda: system(group=mf.SO(3)), "is not a group of"),
     error=(lt.InputError, lt.FunctionError),
