@@ -139,7 +139,7 @@ test_refusals = refusal_test(
     (lambda: system().state(STATE[0]), r"shape \(3, 2, 3\), or flat \(18,\), got \(2, 3\)"),
     (lambda: system().state(np.zeros(17)), r"or flat \(18,\), got \(17,\)"),
     (lambda: system(lt.LocalProjectedMetric(np.ones(6))), r"the shape \(3, 2\) of the sites, got \(6,\)"),
-    (lambda: lt.LocalProjectedMetric([1.0, -1.0]), "must be >= 0, got -1"),
+    (lambda: lt.LocalProjectedMetric([1.0, -1.0]), "must be >= 0 and finite, got"),
     (lambda: system(lt.LocalProjectedMetric(1.0, np.eye(4))), r"shape \(3, 3\), got \(4, 4\)"),
     (
         lambda: system(lt.InnerProductDissipation(np.eye(4))),
