@@ -144,6 +144,7 @@ class LinearFriction(Dissipation):
 
     @staticmethod
     def _force_from_flux(x, p, S, v, T, flux) -> jax.Array:
+        """Return the force, shape (n,), of friction with fluxes: ``-T flux`` on momenta and ``v flux`` on entropies."""
         return jnp.zeros_like(x).at[p].add(-T * flux).at[S].add(v * flux)
 
     def _indices_friction_velocities_temperatures(self, system, x, dH):

@@ -34,6 +34,7 @@ class HeatingSites:
         return values * v if jnp.ndim(values) == 0 else self._scale_each_site(values, v)
 
     def _scale_each_site(self, values, v) -> jax.Array:
+        """Return a vector, shape (n,), times one number for each site, shape (sites,)."""
         return (values[:, None] * v.reshape(len(values), -1)).ravel()
 
     def dot_at_sites(self, alpha, v) -> jax.Array:
@@ -120,6 +121,7 @@ class Geometry(Module):
 
 @jit_subprogram
 def _sharp(space: mf.Space, x, alpha) -> jax.Array:
+    """Return the tangent vector of a covector at a point of a space, by its metric."""
     return space._sharp(x, alpha)
 
 

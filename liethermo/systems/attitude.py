@@ -255,6 +255,7 @@ def momentum_system_of(body: System) -> LiePoissonSystem:
 
 
 def _attitude_residual(system: AttitudeSystem, x) -> jax.Array:
+    """Return the relative distance of the attitude of one state from the group, shape ()."""
     return system.group.defect(system.attitude_layout.split_state(x)[1])
 
 
@@ -332,6 +333,7 @@ class AttitudeChartSystem(LiftedSystem):
         return body.bind_attitude(self._attitude_at(x)) if body.torque_laws.needs_attitude else body
 
     def _attitude_at(self, x) -> jax.Array:
+        """Return the attitude matrix, shape (m, m), at coordinates x of the chart."""
         group = self.attitude_system.group
         return self.attitude @ group.exp_map(group.algebra, self.rotation_angles(x))
 

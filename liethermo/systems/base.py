@@ -337,6 +337,7 @@ class System(SystemInterface):
         return check_system(self, points, samples, seed, scale, times)
 
     def _vector_field(self, x) -> jax.Array:
+        """Return the vector field at one state, shape (n,), from the exact gradients of all functions."""
         if has_generator(self):
             return generator_field(self, x)
         dS = jnp.zeros_like(x) if self.entropy is None else self.entropy.gradient(x)

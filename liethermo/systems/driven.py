@@ -167,6 +167,7 @@ class DrivenSystem(LiftedSystem):
         return jnp.concatenate([self.body.raise_index(x[:-2], alpha[:-2]), jnp.zeros(2)])
 
     def _body_at_time(self, t) -> System:
+        """Return the body with its energy and torque frozen at the time t."""
         return self.body.at_time(t, self.attitude)
 
     # -- functions ----------------------------------------------------------------------------------------------------
@@ -175,6 +176,7 @@ class DrivenSystem(LiftedSystem):
         return self.lift_energy(self.body.energy_of_flat_states(energy))
 
     def _lift_energy_term(self, term: Energy) -> Energy:
+        """Return a term of the energy of the body as a function of states with time and work."""
         clock = _StateTimeMap(self.body.dim, self.unit)
         return _EnergyOfStateAndTime(term.with_time(), clock) if term.depends_on_time else self.lift_energy(term)
 

@@ -178,6 +178,7 @@ class _TangentDissipation(LiftedDissipation):
 
 @jit_subprogram
 def _tangent_force(dissipation: _TangentDissipation, x, dH, dS, dL) -> jax.Array:
+    """Return the force of the inner dissipation, projected to the tangent space of the level sets, shape (n,)."""
     geometry = dissipation.lifted_geometry(dissipation.manifold_system, x)
     velocity = dissipation.inner.force(geometry.system, geometry.x, *geometry.inner_gradients(dH, dS, dL))
     return velocity if dissipation.is_projection_trivial else geometry.lower_velocity(velocity)
@@ -248,10 +249,12 @@ def _tangential_part(system: System, x, w):
 
 @jit_subprogram
 def _tangential_part_in_space(space: mf.Space, x, w):
+    """Return an array w without the component that would change the constraints of a space."""
     return space.to_vector(space._tangential_part(space.from_vector(x), space.from_vector(w)))
 
 
 def _space_of(system: System) -> mf.Space:
+    """Return the space of a system on a manifold."""
     assert system.space is not None
     return system.space
 

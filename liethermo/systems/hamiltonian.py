@@ -423,12 +423,16 @@ class RotatingFrame(metaclass=ListedType):
 
     @property
     def _tolerance(self) -> float:
+        """Difference of frequencies in the frame up to which they count as equal."""
         return len(self.levels) * level_gap_rounding_bound(self.generator)
 
     def _check_size(self, shape: tuple[int, ...], what: str) -> None:
+        """Raise InputError unless a matrix has the shape of the generator."""
         if shape != self.generator.shape:
             generator_shape = self.generator.shape
-            raise InputError(f"{what} has shape {shape}, but the generator of the frame has shape {generator_shape}")
+            raise InputError(
+                f"{what} must have the shape of the generator of the frame, {generator_shape}, got {shape}"
+            )
 
 
 class _FrameHamiltonian(Module):

@@ -201,8 +201,9 @@ class LedgerSystem(System):
         return Domain("a positive temperature", self._why_outside_domain, margin=self.temperature)
 
     def _why_outside_domain(self, x) -> str:
+        """Return that the temperature at a state is not positive, as a text; "" if it is positive."""
         T = float(evaluate_at_points(_temperature, self, np.atleast_2d(x)).min())
-        return "" if T > 0.0 else f"the temperature -dL/dS is {T:.4g}: it has to be positive"
+        return "" if T > 0.0 else f"the temperature -dL/dS must be positive, got {T:.4g}"
 
     def specific_axiom_residuals(self, x) -> dict[str, jax.Array]:
         arguments = self.split_state(x)

@@ -205,6 +205,7 @@ class ComposedSystem(System):
         return Domain("positive temperatures", self._why_outside_domain, margin=lowest_temperature)
 
     def _why_outside_domain(self, x) -> str:
+        """Return which temperatures at states are not positive, as a text; "" if all are positive."""
         T = np.atleast_2d(self.temperatures(x)).min(axis=0)
         cold = np.flatnonzero(~(T > 0.0))
         if not cold.size:

@@ -82,5 +82,5 @@ def test_what_is_refused():
         frame.rotating_wave(UPPER_LEVEL, LOWER + LOWER.T, 2.0)
     with pytest.raises(lt.InputError, match=r"components of the frequencies \[-1.0, 1.0\]"):
         frame.jumps([(LOWER + LOWER.T, 0.1)])
-    with pytest.raises(lt.InputError, match=r"has shape \(3, 3\), but the generator of the frame has shape \(2, 2\)"):
+    with pytest.raises(lt.InputError, match=r"generator of the frame, \(2, 2\), got \(3, 3\)"):
         frame.hamiltonian(np.eye(3))
