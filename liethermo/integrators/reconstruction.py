@@ -115,7 +115,7 @@ class WithAttitude(MethodWrapper):
 
     def start(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
         if not self.explicit:
-            return self.method.start(system.body_at_attitude(x), system.body_states(x))
+            return self.method.start(system.body_at_attitude_of_state(x), system.body_states(x))
         mu, g = system.attitude_layout.split_state(x)
         local, n = AttitudeChartSystem(system, self.order, g), system.group.dim
         k = self.method.start(
@@ -127,7 +127,7 @@ class WithAttitude(MethodWrapper):
 
     def error(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:  # type: ignore[override]
         return self.method.error(
-            system.body_at_attitude(x),
+            system.body_at_attitude_of_state(x),
             system.body_states(x),
             system.body_states(compensation),
             h,

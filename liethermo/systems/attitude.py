@@ -101,12 +101,12 @@ class AttitudeSystem(LiftedSystem):
         clock = self.body.clock
         return clock and replace_fields(clock, n_trailing_counters=self.impulse_dim)
 
-    def body_at_attitude(self, x) -> LiePoissonSystem | DrivenSystem:
+    def body_at_attitude_of_state(self, x) -> LiePoissonSystem | DrivenSystem:
         """Return the body with its torque bound to the attitude of a state."""
         return self.body.bind_attitude(self.attitude_layout.split_state(x)[1])
 
-    def solved_subsystem(self, x) -> tuple[System, jax.Array]:
-        return self.body_at_attitude(x), self.body_states(x)
+    def subsystem_to_solve(self, x) -> tuple[System, jax.Array]:
+        return self.body_at_attitude_of_state(x), self.body_states(x)
 
     def momentum_to_space_matrix(self, g) -> jax.Array:
         """Return the matrix A, shape (..., n, n), that maps a body momentum to space, ``mu @ A``, at the attitude g."""
@@ -221,7 +221,7 @@ class AttitudeSystem(LiftedSystem):
 
     def attitude_velocity(self, x) -> jax.Array:
         """Return the velocity xi of the attitude at a state, ``g' = g hat(xi)``, shape (group.dim,)."""
-        mu, body = self.body_states(x), self.body_at_attitude(x)
+        mu, body = self.body_states(x), self.body_at_attitude_of_state(x)
         dS = body.entropy_gradient(mu)
         xi = body.attitude_velocity_from_gradients(
             mu, body.energy.gradient(mu), dS, tuple(L.gradient(mu) for L in body.preserved_functions)
@@ -229,7 +229,7 @@ class AttitudeSystem(LiftedSystem):
         return xi[: self.group.dim]
 
     def _vector_field(self, x):
-        (mu, g), body = self.attitude_layout.split_state(x), self.body_at_attitude(x)
+        (mu, g), body = self.attitude_layout.split_state(x), self.body_at_attitude_of_state(x)
         p = body.external_torque(mu)[: self.group.dim] @ self.momentum_to_space_matrix(g) if self.impulse_dim else None
         return self.attitude_layout.join_state(
             body._vector_field(mu), g @ self.group.algebra.hat(self.attitude_velocity(x)), p

@@ -265,7 +265,7 @@ class System(SystemInterface):
         """
         return self, x
 
-    def solved_subsystem(self, x) -> tuple[System, jax.Array]:
+    def subsystem_to_solve(self, x) -> tuple[System, jax.Array]:
         """Return the subsystem whose equations a step solves, and the components of x that are its state.
 
         Slopes and errors have its dimension. The other components follow from it, and have tolerances of their own.

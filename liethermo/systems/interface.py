@@ -193,14 +193,23 @@ REPLACED_MEMBERS = {
     "specific_residuals": "specific_axiom_residuals",
     "production_name": "entropy_production_name",
     "freeze_at": "cache_tensors_at",
+    "here": "cache_tensors_at",
     "surface": "constraint_surface",
     "solve_at_spins": "solve_slopes_at_each_spin",
     "transport": "attitude_velocity_from_gradients",
     "energy_of_vectors": "energy_of_flat_states",
     "inner": "inner_system",
     "ledger": "ledger_functions",
+    "own_residuals": "specific_axiom_residuals",
+    "pushed_by": "torque_laws",
+    "casimirs_of_torque": "torque_laws",
+    "left_alone": "drop_torque",
+    "without_baths": "drop_baths",
+    "presented": "to_user_solution",
+    "solved_for": "subsystem_to_solve",
+    "solved_subsystem": "subsystem_to_solve",
 }
-"""Names of members that kinds of systems used to override, and of those that replace them."""
+"""Former names of members that kinds of systems override, and the present names."""
 
 
 class SystemInterface(Geometry):
