@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import manifolds.errors
 
 
@@ -101,3 +103,17 @@ class SpecError(LiethermoError, ValueError):
     def __init__(self, path, problems):
         self.problems = tuple(problems)
         super().__init__("\n  ".join([f"{path} cannot be run:", *self.problems]))
+
+
+def refuse_replaced_members(cls: type, replacements: Mapping[str, str]) -> None:
+    """Raise TypeError if a class defines a member by a former name, under which the library does not call it.
+
+    Parameters
+    ----------
+    cls : type
+    replacements : mapping
+        The present name of each member, by its former name.
+    """
+    for name, replacement in replacements.items():
+        if name in cls.__dict__:
+            raise TypeError(f"{cls.__name__} defines {name}, which nothing calls. Override {replacement}")

@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..functions.bath_energy import BodyBathsEnergy
 from ..functions.density import matrix_logarithm
 from ..functions.indices import Indices
-from .operators import ENERGY_RTOL, commutator, is_hermitian, level_gap_rounding, subtract_common_energy
+from .operators import ENERGY_RTOL, commutator, is_hermitian, level_gap_rounding_bound, subtract_common_energy
 from .quantum import ThermalJumps, apply_jump_friction, cluster_labels
 
 ADIABATIC_LIMIT = 0.1
@@ -51,7 +51,7 @@ class InstantaneousJumps(NamedTuple):
 
 
 class AdiabaticJumps(ThermalJumps):
-    """Jumps between the levels of the moment, for a slow drive that turns eigenvectors [Albash et al. 2012].
+    """Jumps between instantaneous energy levels, for a slow drive that turns eigenvectors [Albash et al. 2012].
 
     The jumps are those of :class:`ThermalJumps` for the Hamiltonian H(t) of each time: a coupling V is split into
     components with ``[H(t), V_omega(t)] = -omega(t) V_omega(t)``, which a bath of the temperature T drives at the rates
@@ -116,10 +116,10 @@ class AdiabaticJumps(ThermalJumps):
         else:
             hamiltonians = system.hamiltonians_at_test_times()
             groups = _group_numbers_of_level_pairs(hamiltonians)
-            self._check_rates_at_zero(hamiltonians)
+            self._check_rates_at_zero_frequency(hamiltonians)
         return replace_fields(self, pair_groups=Indices(groups))
 
-    def _check_rates_at_zero(self, hamiltonians: list[np.ndarray]) -> None:
+    def _check_rates_at_zero_frequency(self, hamiltonians: list[np.ndarray]) -> None:
         """Raise InputError if a rate is infinite at omega = 0, and the coupling has a component of this frequency."""
         for i, (operator, rate) in enumerate(zip(self.operators, self.rates, strict=True)):
             if not callable(rate) or is_traced(rate):
@@ -142,14 +142,16 @@ class AdiabaticJumps(ThermalJumps):
         structure, n = system.structure, system.body_dim
         T = dH[n + self.bath]
         levels, vectors, V, omega, rates = self._jumps_at(system, dH, T)
-        # in the basis of the system, as in dS: in another the logarithms of eigenvalues near zero are others
+        # in the basis of the system, as dS: the logarithms of eigenvalues near zero are rounded differently in another
         logs = matrix_logarithm(structure.matrix(x[:n]))
         rho, A, logs = (adjoint(vectors) @ a @ vectors for a in (*map(structure.matrix, (x[:n], dS[:n])), logs))
         gaps = levels[None, :] - levels[:, None]
         bath_terms = (dS[n + self.bath] * V * gaps - omega[:, None, None] * V) / T
         image = apply_jump_friction(rho, logs, A, V, omega / (2.0 * T), bath_terms)
         drho = jnp.sum(commutator(adjoint(V), image * rates[:, None, None]), axis=0)
-        return self._force_with_bath_entropy_rates(system, T, levels, vectors, drho)  # the adjoints add the adjoint
+        return self._force_with_bath_entropy_rates(
+            system, T, levels, vectors, drho
+        )  # jumps by adjoint operators add the adjoint
 
     def generator_field(self, system, x, dH):
         """Return the force as Lindblad's equation, without a logarithm, followed by the bath entropy rates."""
@@ -248,7 +250,7 @@ def _group_numbers_of_level_pairs(hamiltonians: list[np.ndarray]) -> np.ndarray:
     levels = np.stack([np.linalg.eigvalsh(subtract_common_energy(H)) for H in hamiltonians])
     gaps = levels[:, None, :] - levels[:, :, None]
     # eigenvalues of matrices that are not diagonal are rounded like them
-    tolerances = [size * level_gap_rounding(H) for H in hamiltonians]
+    tolerances = [size * level_gap_rounding_bound(H) for H in hamiltonians]
     labels = np.stack([cluster_labels(gap.ravel(), tolerance) for gap, tolerance in zip(gaps, tolerances, strict=True)])
     zero = (np.abs(gaps.reshape(len(gaps), -1)) <= np.array(tolerances)[:, None]).all(axis=0)
     _, group = np.unique(labels, axis=1, return_inverse=True)

@@ -21,7 +21,7 @@ import scipy
 
 from manifolds._pytree_module import Module, forward_to
 
-from ..errors import InputError
+from ..errors import InputError, refuse_replaced_members
 from ..functions.energy import Energy
 from ..functions.indices import Indices, union_pattern
 from ..tracing.short_form import short_form
@@ -31,6 +31,22 @@ from .geometry import Geometry, divergence_summands_of_fields
 LawName = Literal["conserved", "nondecreasing", "nonincreasing"]
 """Name of the law of a function: how a construction lets it change."""
 T = TypeVar("T")
+
+
+REPLACED_MEMBERS = {
+    "prepared": "bind_to",
+    "own_residuals": "input_residuals",
+    "generated": "generator_field",
+    "heated_bath": "heated_bath_index",
+    "keeps_casimirs": "preserves_casimirs",
+    "noiseless": "is_noiseless",
+    "symmetric": "is_symmetric",
+    "velocity": "added_attitude_velocity",
+    "divergence": "factor_divergence",
+    "changes": "factor_divergence_terms",
+    "can_drive_baths": "can_act_on_baths",
+}
+"""Former names of members that subclasses of :class:`Dissipation` override, and the present names."""
 
 
 class Dissipation(Module):
@@ -43,6 +59,10 @@ class Dissipation(Module):
     """
 
     __repr__ = short_form
+
+    def __init_subclass__(cls, **options):
+        super().__init_subclass__(**options)
+        refuse_replaced_members(cls, REPLACED_MEMBERS)
 
     @property
     def energy_law(self) -> LawName | None:
@@ -85,31 +105,32 @@ class Dissipation(Module):
 
     @property
     def terms(self) -> tuple[Dissipation, ...]:
-        """Return the summands, or this dissipation alone."""
+        """Summands of a sum; a tuple of this dissipation alone if it is no sum."""
         return (self,)
 
     @property
     def preserve(self) -> tuple[Energy, ...]:
+        """Functions besides the energy that the dissipation keeps constant; a sum has those of all summands."""
         return ()
 
     @property
     def needs_entropy(self) -> bool:
+        """True if the force contains the gradient of the entropy, so that the system must have an entropy."""
         return True
 
     @property
     def depends_on_time(self) -> bool:
-        """True if the force depends on the time other than by the gradients, as by a rate that is a function of it."""
+        """True if the force depends explicitly on the time, for example by a rate that is a function of time."""
         return False
 
     @property
-    def can_drive_baths(self) -> bool:
-        """True if the dissipation acts on states of a body followed by bath entropies; the body then has no entropy."""
+    def can_act_on_baths(self) -> bool:
+        """True if the force may have components along bath entropies, in a system whose body has no entropy."""
         return False
 
     @property
     def acts_on_baths_alone(self) -> bool:
-        """True if its force has components along the entropies of baths only, and depends on their temperatures
-        only."""
+        """True if the force changes entropies of baths only, and depends on their temperatures only."""
         return False
 
     def bind_to(self, system: Geometry) -> Dissipation:
@@ -117,8 +138,10 @@ class Dissipation(Module):
         return self
 
     def input_residuals(self, system: Geometry, x) -> dict[str, jax.Array]:
-        """Return, by name, how far the user's functions miss their conditions at x, relative to the terms that
-        cancel."""
+        """Return the relative residuals at x, by name, of the conditions on functions that the user has given.
+
+        A residual is divided by the size of the terms that cancel in it.
+        """
         return {}
 
     @abstractmethod
@@ -137,28 +160,29 @@ class Dissipation(Module):
 
     @property
     def heated_bath_index(self) -> Indices | None:
-        """The number of the bath that takes the heat, one for each site where sites differ; None for the first bath."""
+        """Index of the bath that takes the heat, or one index for each site; None for the first bath."""
         return None
 
     @property
     def has_generator(self) -> bool:
-        """True if :meth:`generator_field` gives the force in a form without the gradient of the entropy."""
+        """True if :meth:`generator_field` computes the force without the gradient of the entropy."""
         return False
 
     def generator_field(self, system: Geometry, x, dH) -> jax.Array:
-        """Return the force for the gradients of energy and entropy at x, shape (n,); see :attr:`has_generator`.
+        """Return the force at x, shape (n,), from a generator that does not need the gradient of the entropy.
 
-        Such a form does not evaluate the entropy, as Lindblad's equation needs no logarithm of the density matrix.
+        It is the force for the exact gradients, and exists if :attr:`has_generator` is True. Lindblad's equation is a
+        generator: it needs no logarithm of the density matrix.
         """
-        raise NotImplementedError(f"{type(self).__name__} has no such form")
+        raise NotImplementedError(f"{type(self).__name__} has no generator")
 
-    def velocity(self, system: Geometry, x, dH, dS, dL) -> jax.Array | None:
-        """Return the covector sigma, shape (n,), with the force ``Pi(x) sigma``; None if the construction has none.
+    def added_attitude_velocity(self, system: Geometry, x, dH, dS, dL) -> jax.Array | None:
+        """Return the velocity sigma, shape (n,), that the force adds to that of an attitude; None for other forces.
 
-        On a Lie algebra the force is ``ad*_sigma x``, for example internal friction of a body, which carries the
-        momentum along its coadjoint orbit by the additional velocity sigma. An attitude that follows sigma too
-        conserves the spatial momentum. A force of another form is an external torque. Whether the result is None
-        depends on the construction alone.
+        Internal friction of a body has the force ``Pi(x) sigma``, on a Lie algebra ``ad*_sigma x``, which carries the
+        momentum along its coadjoint orbit. Then the attitude with ``g' = g hat(dH + sigma)`` conserves the spatial
+        momentum. If the force changes internal momenta only, such as those of rotors, sigma is zero. A force of another
+        form is an external torque, and the result is None. Whether it is None depends on the construction alone.
         """
         return None
 
@@ -171,17 +195,17 @@ class Dissipation(Module):
         """
         return None
 
-    def divergence(self, system: Geometry, x) -> jax.Array:
+    def factor_divergence(self, system: Geometry, x) -> jax.Array:
         """Return the divergence of each column of the factor B at x, shape (columns,).
 
         It is computed by differentiation, except where the construction makes it vanish.
         """
         B = self.factor_at_state(system, x)
         assert B is not None
-        return jnp.zeros(B.size) if B.solenoidal else jnp.sum(self.divergence_terms(system, x), axis=0)
+        return jnp.zeros(B.size) if B.solenoidal else jnp.sum(self.factor_divergence_terms(system, x), axis=0)
 
-    def divergence_terms(self, system: Geometry, x) -> jax.Array:
-        """Return the terms, shape (n, columns), whose sum over the first axis is the divergence of each column."""
+    def factor_divergence_terms(self, system: Geometry, x) -> jax.Array:
+        """Return the terms, shape (n, columns), whose sum over the first axis is :meth:`factor_divergence`."""
 
         def contract_columns(y, alpha) -> jax.Array:
             B = self.factor_at_state(system, y)

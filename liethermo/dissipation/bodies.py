@@ -131,11 +131,11 @@ class LinearFriction(Dissipation):
     body_index: int | None = eqx.field(static=True, default=None)
 
     def force(self, system, x, dH, dS, dL):
-        p, S, R, v, T = self._indices_form_velocities_temperatures(system, x, dH)
+        p, S, R, v, T = self._indices_friction_velocities_temperatures(system, x, dH)
         return self._force_from_flux(x, p, S, v, T, _apply_friction_matrix(R, (v * dS[S] - T * dS[p]) / T))
 
     def factor(self, system, x, dH, dL):
-        p, S, R, v, T = self._indices_form_velocities_temperatures(system, x, dH)
+        p, S, R, v, T = self._indices_friction_velocities_temperatures(system, x, dH)
         matrix_root = semidefinite_root if callable(self.R) else semidefinite_factor
         root = jnp.sqrt(R) if jnp.ndim(R) < 2 else matrix_root(R)
         return Factor(
@@ -144,9 +144,10 @@ class LinearFriction(Dissipation):
 
     @staticmethod
     def _force_from_flux(x, p, S, v, T, flux) -> jax.Array:
+        """Return the force, shape (n,), of friction with fluxes: ``-T flux`` on momenta and ``v flux`` on entropies."""
         return jnp.zeros_like(x).at[p].add(-T * flux).at[S].add(v * flux)
 
-    def _indices_form_velocities_temperatures(self, system, x, dH):
+    def _indices_friction_velocities_temperatures(self, system, x, dH):
         """Return the indices of momenta and entropies, R, the velocities and the temperatures: (p, S, R, v, T)."""
         indices = _state_indices(system)
         numbers = (

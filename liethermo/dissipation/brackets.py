@@ -31,7 +31,7 @@ from .checks import (
     require_algebra,
 )
 from .factor import Factor, form_root
-from .geometry import isotropic_size, isotropic_vector
+from .geometry import isotropic_noise, isotropic_noise_dim
 
 
 class DoubleBracket(Damping):
@@ -83,12 +83,12 @@ class DoubleBracket(Damping):
         return self if metric is self.metric else eqx.tree_at(lambda d: d.metric, self, metric)
 
     def force(self, system, x, dH, dS, dL):
-        return self.rate * system.poisson.sharp(x, self._bracket_velocity(system, x, dH))
+        return self.rate * system.poisson.sharp(x, self._velocity_at_unit_rate(system, x, dH))
 
-    def velocity(self, system, x, dH, dS, dL):
-        return self.rate * self._bracket_velocity(system, x, dH)
+    def added_attitude_velocity(self, system, x, dH, dS, dL):
+        return self.rate * self._velocity_at_unit_rate(system, x, dH)
 
-    def _bracket_velocity(self, system, x, dH) -> jax.Array:
+    def _velocity_at_unit_rate(self, system, x, dH) -> jax.Array:
         """Return sigma = ``(Pi dH)^♯``, shape (n,), by the metric; the force is ``rate * Pi sigma``."""
         motion = system.poisson.sharp(x, dH)
         return system.lower_index(x, motion) if self.metric is None else self.metric @ motion
@@ -96,14 +96,14 @@ class DoubleBracket(Damping):
     def factor(self, system, x, dH, dL):
         root = None if self.metric is None else form_root(self.metric)
 
-        def velocity(w):
-            return system.lower_index(x, isotropic_vector(system, x, w)) if root is None else root @ w
+        def added_attitude_velocity(w):
+            return system.lower_index(x, isotropic_noise(system, x, w)) if root is None else root @ w
 
         def times(w):
-            return system.poisson.sharp(x, velocity(w))
+            return system.poisson.sharp(x, added_attitude_velocity(w))
 
-        n_columns = isotropic_size(system) if root is None else system.dim
-        return Factor(n_columns, times, velocity=velocity).scale_by(self.rate)
+        n_columns = isotropic_noise_dim(system) if root is None else system.dim
+        return Factor(n_columns, times, added_attitude_velocity=added_attitude_velocity).scale_by(self.rate)
 
 
 def _checked_metric(metric) -> Any:

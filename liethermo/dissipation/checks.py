@@ -40,7 +40,7 @@ def repeat_over_sites(form, system: Geometry):
 
 
 def state_shape_dtype(dim: int):
-    """Return the abstract value of a state of this dimension."""
+    """Return the shape and dtype of a state of a dimension, for abstract evaluation by JAX."""
     return jax.ShapeDtypeStruct((dim,), jnp.float64)
 
 
@@ -59,7 +59,7 @@ def checked_rates(rates) -> jax.Array:
 
 
 def checked_bath_indices(bath) -> Indices | None:
-    """Return the number of a bath, or one for each site; the system later checks that the baths exist."""
+    """Return the index of a bath, or one for each site, as checked integers; the system checks that the baths exist."""
     if bath is None or isinstance(bath, Indices):
         return bath
     numbers = np.asarray(bath)
@@ -69,11 +69,11 @@ def checked_bath_indices(bath) -> Indices | None:
 
 
 def reject_rate_as_form(form, dissipation: object, label: str) -> None:
-    """Raise InputError if a number is passed for a form: it is more likely meant as a rate."""
+    """Raise InputError if a number is passed for a form: it is probably meant as a rate."""
     if isinstance(form, int | float):
         raise InputError(
-            f"{type(dissipation).__name__} takes {label} first, a matrix, and {form} is a number: for a rate say "
-            f"rate={form}"
+            f"{type(dissipation).__name__} takes {label}, a matrix, as its first argument, got the number {form}. "
+            f"For a rate give rate={form}"
         )
 
 
@@ -132,5 +132,7 @@ def require_algebra(system: Geometry, name: str, form=None) -> mf.LieAlgebra:
         raise InputError(f"{name} needs a Lie algebra. Use it in a LiePoissonSystem, or use ProjectedMetric()")
     dim = algebra.dim if form is None or isinstance(form, BlockDiagonal) else form.shape[0]
     if dim != algebra.dim:
-        raise InputError(f"the form of {name} is ({dim}, {dim}), but {algebra.name} has dimension {algebra.dim}")
+        raise InputError(
+            f"the form of {name} must have shape ({algebra.dim}, {algebra.dim}) on {algebra.name}, got ({dim}, {dim})"
+        )
     return algebra

@@ -28,9 +28,9 @@ class Factor(NamedTuple):
         Maps w, shape (size,), to ``B w``, shape (n,); linear.
     solenoidal : bool
         True if every column, at the gradients of the functions, is a field of divergence zero.
-    velocity : function or None
-        Maps w to sigma with ``B w = Pi(x) sigma``, if the construction has this form: see
-        :meth:`.Dissipation.velocity`.
+    added_attitude_velocity : function or None
+        Maps w to the velocity that the force ``B w`` adds to an attitude: see
+        :meth:`.Dissipation.added_attitude_velocity`. None if such a force is an external torque.
     spin_coefficients : array or None
         Numbers r, of shape () or (sites,), with ``B w = r_i w_i x s_i`` at every spin, if B has this form and w has
         three components for each spin: see :class:`.StochasticMidpoint`.
@@ -39,7 +39,7 @@ class Factor(NamedTuple):
     size: int
     times: Callable[[jax.Array], jax.Array]
     solenoidal: bool = False
-    velocity: Callable[[jax.Array], jax.Array] | None = None
+    added_attitude_velocity: Callable[[jax.Array], jax.Array] | None = None
     spin_coefficients: jax.Array | None = None
 
     def transpose_times(self, alpha) -> jax.Array:
@@ -49,10 +49,13 @@ class Factor(NamedTuple):
     def scale_by(self, rate) -> Factor:
         """Return the factor of ``rate * K``; the rate is a number, which may depend on the state."""
         scale = sqrt_or_zero(rate)
-        velocity = None if (velocity_map := self.velocity) is None else lambda w: scale * velocity_map(w)
+        velocity_map = self.added_attitude_velocity
+        scaled_map = None if velocity_map is None else lambda w: scale * velocity_map(w)
         spin_coefficients = None if self.spin_coefficients is None else scale * self.spin_coefficients
         return self._replace(
-            times=lambda w: scale * self.times(w), velocity=velocity, spin_coefficients=spin_coefficients
+            times=lambda w: scale * self.times(w),
+            added_attitude_velocity=scaled_map,
+            spin_coefficients=spin_coefficients,
         )
 
 

@@ -30,7 +30,7 @@ from .checks import (
     require_algebra,
 )
 from .factor import Factor
-from .geometry import isotropic_size, isotropic_vector, project_tangent
+from .geometry import isotropic_noise, isotropic_noise_dim, project_tangent
 
 
 class Friction(Damping):
@@ -91,7 +91,7 @@ class Friction(Damping):
     def factor(self, system, x, dH, dL):
         if self.D is None:
             return Factor(
-                isotropic_size(system), lambda w: isotropic_vector(system, x, w), system.space is None
+                isotropic_noise_dim(system), lambda w: isotropic_noise(system, x, w), system.space is None
             ).scale_by(self.rate)
         root = semidefinite_root(self.D(x)) if callable(self.D) else semidefinite_factor(self.D)
         constant = system.space is None and not callable(self.D)
@@ -162,7 +162,7 @@ class FrictionOperator(Dissipation):
             raise InputError(f"projection must be 'oblique' or 'orthogonal', got {projection!r}")
         self.projection = projection
 
-    can_drive_baths = True
+    can_act_on_baths = True
 
     def bind_to(self, system):
         check_form_shape(self.K, system.dim, "the friction operator K")

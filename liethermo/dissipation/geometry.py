@@ -1,4 +1,4 @@
-"""The geometry of a system, as dissipations use it."""
+"""Interface of systems to their dissipations: structure, metric of the space, sites, and isotropic noise."""
 
 from __future__ import annotations
 
@@ -29,14 +29,15 @@ class HeatingSites:
     def __init__(self, shape: tuple[int, ...]):
         self.shape = shape
 
-    def scale(self, values, v) -> jax.Array:
+    def scale_at_sites(self, values, v) -> jax.Array:
         """Return a vector, shape (n,), times one number for each site, shape (sites,), or times a single number."""
-        return values * v if jnp.ndim(values) == 0 else self._scale_each(values, v)
+        return values * v if jnp.ndim(values) == 0 else self._scale_each_site(values, v)
 
-    def _scale_each(self, values, v) -> jax.Array:
+    def _scale_each_site(self, values, v) -> jax.Array:
+        """Return a vector, shape (n,), times one number for each site, shape (sites,)."""
         return (values[:, None] * v.reshape(len(values), -1)).ravel()
 
-    def dot(self, alpha, v) -> jax.Array:
+    def dot_at_sites(self, alpha, v) -> jax.Array:
         """Return ``alpha . v`` at each site, shape (sites,)."""
         return jnp.sum((alpha * v).reshape(math.prod(self.shape), -1), axis=1)
 
@@ -120,6 +121,7 @@ class Geometry(Module):
 
 @jit_if_traced
 def _sharp(space: mf.Space, x, alpha) -> jax.Array:
+    """Return the tangent vector of a covector at a point of a space, by its metric."""
     return space._sharp(x, alpha)
 
 
@@ -130,12 +132,12 @@ def project_tangent(system: Geometry, x, w) -> jax.Array:
     return system.space.to_vector(system.space._project_tangent(system.points(x), system.points(w)))
 
 
-def isotropic_size(system: Geometry) -> int:
-    """Return the number of independent Gaussian numbers in an isotropic random vector: see :func:`isotropic_vector`."""
+def isotropic_noise_dim(system: Geometry) -> int:
+    """Return the number of independent Gaussian numbers in an isotropic random vector: see :func:`isotropic_noise`."""
     return system.dim if system.space is None else system.space.isotropic_size
 
 
-def isotropic_vector(system: Geometry, x, w) -> jax.Array:
+def isotropic_noise(system: Geometry, x, w) -> jax.Array:
     """Return the tangent vector ``R w``, shape (n,), with ``R R^T`` the inverse of the metric; w itself on R^n."""
     return w if system.space is None else system.space.to_vector(system.space._isotropic(system.points(x), w))
 

@@ -57,9 +57,9 @@ class Heating(LiftedDissipation):
         )
         return self._append_entropy_rates(body, force, dH, n)
 
-    def velocity(self, system, x, dH, dS, dL):
+    def added_attitude_velocity(self, system, x, dH, dS, dL):
         body, n = system.drop_baths(), system.body_dim
-        return self.inner.velocity(
+        return self.inner.added_attitude_velocity(
             body, x[:n], self._effective_energy_gradient(body, dH, dS, n), None, tuple(L[:n] for L in dL)
         )
 
@@ -72,28 +72,33 @@ class Heating(LiftedDissipation):
         scale = sqrt_or_zero(self.temperature_signs(dH[n:]) * T)
 
         def times(w):
-            return self._append_entropy_rates(body, body.heating_sites.scale(scale, B.times(w)), dH, n)
+            return self._append_entropy_rates(body, body.heating_sites.scale_at_sites(scale, B.times(w)), dH, n)
 
-        velocity_map = B.velocity
-        velocity = None if velocity_map is None else lambda w: body.heating_sites.scale(scale, velocity_map(w))
+        velocity_map, scale_at_sites = B.added_attitude_velocity, body.heating_sites.scale_at_sites
+        scaled_map = None if velocity_map is None else lambda w: scale_at_sites(scale, velocity_map(w))
         spin_coefficients = None if B.spin_coefficients is None else scale * B.spin_coefficients
-        return B._replace(times=times, velocity=velocity, spin_coefficients=spin_coefficients, solenoidal=False)
+        return B._replace(
+            times=times,
+            added_attitude_velocity=scaled_map,
+            spin_coefficients=spin_coefficients,
+            solenoidal=False,
+        )
 
-    def divergence(self, system, x):
-        """Return the divergence of each column of B, ``sqrt(T) div B0 + T' B0^T dH / (2 T^3/2)``, T' = dT/dy."""
+    def factor_divergence(self, system, x):
+        """Return the divergence of each column of B: ``sqrt(T) div B0 + T' B0^T dH / (2 T^3/2)``, T' = dT/dy."""
         body, n = system.drop_baths(), system.body_dim
         dH, dL = system.energy.gradient(x), tuple(L.gradient(x) for L in self.preserve)
         B = self.inner.factor(body, x[:n], dH[:n], tuple(L[:n] for L in dL))
         assert B is not None
         if self.has_site_baths and not B.solenoidal:  # each site has a temperature of its own
-            return super().divergence(system, x)
+            return super().factor_divergence(system, x)
         T = jnp.abs(self.bath_values_at_sites(dH[n:]))
-        body_divergence = jnp.zeros(B.size) if B.solenoidal else jnp.sqrt(T) * self.inner.divergence(body, x[:n])
+        body_divergence = jnp.zeros(B.size) if B.solenoidal else jnp.sqrt(T) * self.inner.factor_divergence(body, x[:n])
         slopes = temperature_derivatives_by_entropy(system.energy, x, n)
         if slopes is None:
             return body_divergence
         ratio = jnp.where(T > 0.0, 0.5 * self.bath_values_at_sites(slopes) / jnp.where(T > 0.0, T, 1.0) ** 1.5, 0.0)
-        return body_divergence + B.transpose_times(body.heating_sites.scale(ratio, dH[:n]))
+        return body_divergence + B.transpose_times(body.heating_sites.scale_at_sites(ratio, dH[:n]))
 
     def lifted_geometry(self, system, x) -> LiftedGeometry:
         return _body_inner_geometry(system, x)
@@ -120,14 +125,14 @@ class Heating(LiftedDissipation):
         return jnp.where(np.arange(len(T)) == int(np.asarray(self.bath)), energy_loss / T, 0.0)
 
     def _effective_energy_gradient(self, body: Geometry, dH, dS, body_dim: int) -> jax.Array:
-        """Return the gradient that replaces dH in the force on the body, shape (n,): dH for the bath entropy."""
+        """Return the gradient that replaces dH in the force on the body, shape (n,); dH if S is the bath entropy."""
         T, dS_y, sign = (
             self.bath_values_at_sites(dH[body_dim:]),
             self.bath_values_at_sites(dS[body_dim:]),
             self.temperature_signs(dH[body_dim:]),
         )
-        scale = body.heating_sites.scale
-        return scale(sign, scale(dS_y, dH[:body_dim]) - scale(T, dS[:body_dim]))
+        scale_at_sites = body.heating_sites.scale_at_sites
+        return scale_at_sites(sign, scale_at_sites(dS_y, dH[:body_dim]) - scale_at_sites(T, dS[:body_dim]))
 
     def bath_values_at_sites(self, bath_values) -> jax.Array:
         """Return for each site, shape () or (sites,), the value of the bath that it heats, from those of all (m,)."""
@@ -139,7 +144,9 @@ class Heating(LiftedDissipation):
 
     def _append_entropy_rates(self, body: Geometry, v, dH, body_dim: int) -> jax.Array:
         """Return the velocity v of the body, shape (n,), followed by the entropy rates from the energy it loses."""
-        energy_gain = body.heating_sites.dot(dH[:body_dim], v) if self.has_site_baths else jnp.dot(dH[:body_dim], v)
+        energy_gain = (
+            body.heating_sites.dot_at_sites(dH[:body_dim], v) if self.has_site_baths else jnp.dot(dH[:body_dim], v)
+        )
         return jnp.concatenate([v, self.entropy_rates(-energy_gain, dH[body_dim:])])
 
 
@@ -149,9 +156,9 @@ class HeatlessDissipation(LiftedDissipation):
     def lifted_geometry(self, system, x) -> LiftedGeometry:
         return _body_inner_geometry(system, x)
 
-    def velocity(self, system, x, dH, dS, dL):
+    def added_attitude_velocity(self, system, x, dH, dS, dL):
         geometry = _body_inner_geometry(system, x)
-        return self.inner.velocity(geometry.system, geometry.x, *geometry.inner_gradients(dH, dS, dL))
+        return self.inner.added_attitude_velocity(geometry.system, geometry.x, *geometry.inner_gradients(dH, dS, dL))
 
 
 def _body_inner_geometry(system: Geometry, x) -> LiftedGeometry:
@@ -239,7 +246,7 @@ class BathConduction(HeatConduction):
     """
 
     acts_on_baths_alone = True
-    can_drive_baths = True
+    can_act_on_baths = True
 
     def __init__(self, conductance):
         n_baths = _count_baths(conductance)
@@ -248,11 +255,11 @@ class BathConduction(HeatConduction):
 
     def bind_to(self, system):
         n_baths = system.baths.number
-        last = int(np.max(np.asarray(self.second_bodies), initial=0))
-        if last >= n_baths:
+        last_bath = int(np.max(np.asarray(self.second_bodies), initial=0))
+        if last_bath >= n_baths:
             raise InputError(
-                f"BathConduction joins bath {last}, but there are {n_baths} baths, numbered from 0. Give the system "
-                f"baths=lt.HeatBaths(..., number={last + 1})"
+                f"BathConduction joins bath {last_bath}, but there are {n_baths} baths, numbered from 0. Give the "
+                f"system baths=lt.HeatBaths(..., number={last_bath + 1})"
             )
         return self
 
@@ -260,19 +267,19 @@ class BathConduction(HeatConduction):
         return np.arange(system.body_dim, system.dim)
 
     def entropy_rates(self, T, dS) -> jax.Array:
-        """Return the growth rates of the entropies of all baths.
+        """Return the growth rates of the entropies of all baths, shape (number,), by conduction.
 
         Parameters
         ----------
         T, dS : array, shape (number,)
             Temperatures of the baths, and the gradient of the entropy by theirs.
         """
-        first, second = self.edge_entropy_rates(T, T, dS, T)
+        first_rates, second_rates = self.edge_entropy_rates(T, T, dS, T)
         i, j = np.asarray(self.first_bodies), np.asarray(self.second_bodies)
-        return jnp.zeros_like(T).at[i].add(first).at[j].add(second)
+        return jnp.zeros_like(T).at[i].add(first_rates).at[j].add(second_rates)
 
-    def divergence(self, system, x):
-        """Return the divergence of each column of B.
+    def factor_divergence(self, system, x):
+        """Return the divergence of each column of the factor B, shape (edges,).
 
         It is ``sqrt(G T_i / T_j) T_j' / (2 T_j) - sqrt(G T_j / T_i) T_i' / (2 T_i)``.
 

@@ -77,7 +77,7 @@ class LandauLifshitz(Damping):
         spins = system.poisson
         if not isinstance(spins, Spins):
             raise InputError(
-                "LandauLifshitz needs a SpinSystem. For so(3) at every site use DoubleBracket, which is the same"
+                "LandauLifshitz needs a SpinSystem. For so(3) at every site use DoubleBracket, which has the same force"
             )
         if self.rate.shape not in ((), spins.sites):
             raise InputError(

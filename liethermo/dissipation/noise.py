@@ -49,7 +49,7 @@ def noisy_terms_with_factors(
 def factor_divergences(dissipation: Dissipation, system: Geometry, x) -> jax.Array:
     """Return the divergence of every column of the factors, at the gradients of the functions, shape (columns,)."""
     return jnp.concatenate(
-        [jnp.zeros(0), *(term.divergence(system, x) for term, _ in _noisy_terms_with_values(dissipation))]
+        [jnp.zeros(0), *(term.factor_divergence(system, x) for term, _ in _noisy_terms_with_values(dissipation))]
     )
 
 
@@ -60,7 +60,7 @@ def terms_with_factors_at_state(dissipation: Dissipation, system: Geometry, x) -
 
 
 def factor_check_residuals(dissipation: Dissipation, system: Geometry, x) -> dict[str, jax.Array]:
-    """Return, by name, how far the factors miss each of their properties at x, relative to the terms that cancel."""
+    """Return the relative residuals at x, by name, of the properties that the factors must have."""
     dH = system.energy.gradient(x)
     (generic,) = generic_covectors(x.shape[0], 1)
     residuals: dict[str, list[jax.Array]] = {
@@ -83,7 +83,7 @@ def factor_check_residuals(dissipation: Dissipation, system: Geometry, x) -> dic
         ]
         residuals[FACTOR_KERNEL_CHECK] += kernel
         if B.solenoidal:
-            divergence_terms = term.divergence_terms(system, x)
+            divergence_terms = term.factor_divergence_terms(system, x)
             # The first scale alone would be too small where the terms are mere rounding.
             scale = jnp.max(jnp.abs(divergence_terms)) + size / (1.0 + jnp.linalg.norm(x))
             residuals[FACTOR_DIVERGENCE_CHECK].append(_relative_max(jnp.sum(divergence_terms, axis=0), scale))

@@ -86,7 +86,7 @@ def subtract_common_energy(H: np.ndarray) -> np.ndarray:
     return H - lower_level_of_smallest_gap(np.diag(H).real) * np.eye(len(H))
 
 
-def level_gap_rounding(H: np.ndarray) -> float:
+def level_gap_rounding_bound(H: np.ndarray) -> float:
     """Return the largest amount by which rounding makes two equal gaps between levels of H differ."""
     return ENERGY_RTOL * (1 if is_diagonal(H) else len(H)) * float(np.linalg.norm(H, 2))
 

@@ -28,7 +28,7 @@ from .checks import (
     reject_rate_as_form,
 )
 from .factor import Factor
-from .geometry import isotropic_size, isotropic_vector, project_tangent
+from .geometry import isotropic_noise, isotropic_noise_dim, project_tangent
 
 
 class GlobalRateWarning(UserWarning):
@@ -129,7 +129,7 @@ class ProjectedMetric(Dissipation):
             if G is not None:
                 return None
             return self._projected_factor(
-                system, x, dH, dL, isotropic_size(system), lambda w: isotropic_vector(system, x, w)
+                system, x, dH, dL, isotropic_noise_dim(system), lambda w: isotropic_noise(system, x, w)
             )
         root = jnp.eye(n) if G is None else semidefinite_root(G) if callable(self.cometric) else semidefinite_factor(G)
         if not dL and not self.normalized:
@@ -182,7 +182,7 @@ class LocalProjectedMetric(Dissipation):
     def bind_to(self, system):
         if system.space is not None:
             raise InputError(
-                "LocalProjectedMetric needs a system on copies of an algebra, and this one is on a manifold"
+                "LocalProjectedMetric needs a system on copies of an algebra, but this one is on a manifold"
             )
         if self.rate.shape not in ((), system.sites):
             raise InputError(

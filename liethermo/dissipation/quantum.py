@@ -34,7 +34,7 @@ from .operators import (
     is_commuting,
     is_diagonal,
     is_hermitian,
-    level_gap_rounding,
+    level_gap_rounding_bound,
     subtract_common_energy,
 )
 
@@ -129,7 +129,7 @@ class ThermalJumps(Dissipation):
             _checked_rate_function(rate, i) if callable(rate) else checked_rate(rate)
             for i, (_, rate) in enumerate(pairs)
         )
-        self.timed_rates = tuple(i for i, rate in enumerate(self.rates) if _takes_time(rate))
+        self.timed_rates = tuple(i for i, rate in enumerate(self.rates) if _rate_depends_on_time(rate))
         self.bath, self.jumps, self.jump_frame, self.level_order, self.is_driven = bath, (), None, (), False
         self.is_isolated, self.conserves_energy = False, True
 
@@ -191,7 +191,7 @@ class ThermalJumps(Dissipation):
         return structure
 
     def replace_operators(self, matrices: Sequence[Any], bath: int) -> ThermalJumps:
-        """Return jumps with these matrices, for example of a larger system, another bath, and unchanged rates."""
+        """Return jumps with other matrices, such as those of a larger system, another bath and unchanged rates."""
         return replace_fields(self, operators=tuple(map(Operator, matrices)), bath=bath, jumps=())
 
     def force(self, system, x, dH, dS, dL):
@@ -222,7 +222,7 @@ class ThermalJumps(Dissipation):
         drho = jnp.sum(
             commutator(V_adjoint, image * self._weighted_jump_rates(system, omega, T)[:, None, None]), axis=0
         )
-        return self._append_bath_entropy_rates(system, dH, T, drho)  # the adjoints add the adjoint
+        return self._append_bath_entropy_rates(system, dH, T, drho)  # jumps by adjoint operators add the adjoint
 
     has_generator = True
 
@@ -256,7 +256,7 @@ class ThermalJumps(Dissipation):
                 arguments = (omega, T, 0.0)[: 3 if jump.coupling_index in self.timed_rates else 2]
                 strength = jump.weight * np.asarray(rate(*arguments) if callable(rate) else rate, dtype=np.float64)
                 exact_rate = float(strength * np.exp(np.float64(w) / (2.0 * T)))
-            # the exponential is to blame, not the rate
+            # the exponential overflows, not the rate
             if w > -2.0 * np.log(EPS) * T and not exact_rate * EPS <= w:
                 raise InputError(
                     f"jumps of V[{jump.coupling_index}] with the energy {w:.3g} have, at T = {T:.3g}, "
@@ -461,7 +461,7 @@ def _checked_rate_function(rate: Callable, i: int) -> Callable:
     """Return a rate function of omega and T, or of omega, T and t, tested at omega = T = 1 and t = 0."""
     what = f"the rate of V[{i}] must be a number, or a function of omega and T, or of omega, T and t, to a number >= 0"
     try:
-        value = rate(*(1.0, 1.0, 0.0)[: 3 if _takes_time(rate) else 2])
+        value = rate(*(1.0, 1.0, 0.0)[: 3 if _rate_depends_on_time(rate) else 2])
     except TypeError as error:
         raise InputError(f"{what}: {error}") from None
     if np.shape(value) or jnp.result_type(value).kind not in "fiu":
@@ -471,7 +471,7 @@ def _checked_rate_function(rate: Callable, i: int) -> Callable:
     return rate
 
 
-def _takes_time(rate) -> bool:
+def _rate_depends_on_time(rate) -> bool:
     """Return whether a rate is a function of omega, T and the time."""
     return callable(rate) and required_argument_count(rate) == 3
 
@@ -479,14 +479,15 @@ def _takes_time(rate) -> bool:
 def _jumps_of_coupling(
     operator: Operator, coupling_index: int, hamiltonians: Sequence[np.ndarray], frame: np.ndarray
 ) -> list[Jump]:
-    """Return the jumps of a coupling: its eigenoperators of ``[H, .]``, if Hermitian one of each adjoint pair.
+    """Return the jumps of a coupling, the eigenoperators of ``[H, .]`` whose sum it is.
 
-    The entries of an eigenoperator have the same difference of levels, in the frame, under each of the Hamiltonians.
+    If the coupling is Hermitian, one eigenoperator of each adjoint pair is returned. The entries of an eigenoperator
+    have the same difference of levels, in the frame, under each of the Hamiltonians.
     """
     V = np.asarray(operator)
     V_framed = adjoint(frame) @ V @ frame
     framed_hamiltonians = [adjoint(frame) @ subtract_common_energy(H) @ frame for H in hamiltonians]
-    tolerances = [level_gap_rounding(H) for H in hamiltonians]
+    tolerances = [level_gap_rounding_bound(H) for H in hamiltonians]
     entries = np.nonzero(np.abs(V_framed) > _entry_rounding_bounds(V_framed, frame, framed_hamiltonians, tolerances))
     gaps = np.stack([np.diag(H).real[entries[1]] - np.diag(H).real[entries[0]] for H in framed_hamiltonians])
     labels = np.stack(
@@ -522,7 +523,7 @@ def _jumps_of_coupling(
 def _entry_rounding_bounds(
     V_framed: np.ndarray, frame: np.ndarray, framed_hamiltonians: Sequence[np.ndarray], tolerances: Sequence[float]
 ) -> np.ndarray | float:
-    """Return the bound, shape (N, N), below which entries of a matrix in the frame may be rounding; 0 for the axes.
+    """Return bounds, shape (N, N), of the rounding errors of the entries of a matrix in a frame; 0 if it is diagonal.
 
     An eigenvector contains another one by the rounding of the energies, relative to their difference.
     """
@@ -539,7 +540,7 @@ def _entry_rounding_bounds(
 
 
 def cluster_labels(numbers: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return the cluster of each number; a new cluster begins more than ``tolerance`` above the start of the last."""
+    """Return the label of the cluster of each number; numbers of a cluster differ by at most ``tolerance``."""
     labels, cluster_start, label = np.empty(len(numbers), int), -np.inf, -1
     for i in np.argsort(numbers):
         if numbers[i] > cluster_start + tolerance:

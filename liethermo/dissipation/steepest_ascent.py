@@ -72,7 +72,8 @@ class SteepestEntropyAscent(Dissipation):
             if isinstance(f, Operator):
                 if np.shape(f) != (structure.size,) * 2:
                     raise InputError(
-                        f"preserve[{i}] has shape {np.shape(f)}, and the Hamiltonian that of {structure.size}"
+                        f"preserve[{i}] must have the shape of the Hamiltonian, {(structure.size,) * 2}, "
+                        f"got {np.shape(f)}"
                     )
                 f = Function(_Observable(jnp.asarray(structure.vector(np.asarray(f)))))
             elif not isinstance(f, Energy):

@@ -49,7 +49,7 @@ def initial_adaptive_state(
 ) -> AdaptiveState:
     """Return the adaptive state at the start of a run from x, at time t, with the first step size chosen."""
     state, zero = initial_run_state(system, method, x), jnp.zeros(())
-    solved_system, components = system.solved_subsystem(x)
+    solved_system, components = system.subsystem_to_solve(x)
     norm = jnp.max(jnp.abs(components))
     scale = jnp.where(norm > 0.0, norm, 1.0)
     relative_rate = jnp.max(jnp.abs(solved_system.vector_field(components))) / scale
@@ -122,7 +122,7 @@ def accept_or_reject(
     is_accepted, next_step_size, code = is_solved, adaptive_state.next_step_size, new_state.status
     max_rate, optimal_step = adaptive_state.max_relative_rate, adaptive_state.optimal_step_size
     if control.adaptive:
-        x_before, x_after = (system.solved_subsystem(x)[1] for x in (old_state.x, new_state.x))
+        x_before, x_after = (system.subsystem_to_solve(x)[1] for x in (old_state.x, new_state.x))
         norm = jnp.maximum(jnp.max(jnp.abs(x_before)), jnp.max(jnp.abs(x_after)))
         scale = jnp.where(norm > 0.0, norm, 1.0)
         relative_change = jnp.max(jnp.abs(x_after - x_before)) / scale
@@ -198,7 +198,7 @@ def accept_or_reject(
     if not control.adaptive:
         return new_adaptive_state
     limited_state = limit_next_step_by_growth_rate(
-        method, new_adaptive_state, probe_jacobian(*system.solved_subsystem(new_state.x))
+        method, new_adaptive_state, probe_jacobian(*system.subsystem_to_solve(new_state.x))
     )
     new_adaptive_state = jax.tree_util.tree_map(select_if_running, limited_state, new_adaptive_state)
     is_exhausted = (n_attempts >= control.max_attempts) & (new_adaptive_state.state.status == StatusCode.COMPLETED)

@@ -142,7 +142,7 @@ def solve_fixed_point(equations: StageEquations, options: SolverOptions = DEFAUL
 
 def slope_rounding_scale(system: System, x, options: SolverOptions = DEFAULT_OPTIONS) -> jax.Array:
     """Return the norm of the rounding errors of the vector field at x, shape ()."""
-    system, x = system.solved_subsystem(x)
+    system, x = system.subsystem_to_solve(x)
     return options.norm_for_dim(x.size)(value_and_rounding_scale(system.vector_field, x)[1])
 
 
@@ -308,7 +308,7 @@ def explicit_stage_solution(
 ) -> StageSolution:
     """Return the slopes of an explicit step as a solution, converged if its end satisfies the constraints."""
     k = method.slopes(system, x, compensation, h, k)
-    x, zero_count = system.solved_subsystem(x)[1], jnp.zeros((), dtype=jnp.int64)
+    x, zero_count = system.subsystem_to_solve(x)[1], jnp.zeros((), dtype=jnp.int64)
     norm = options.norm_for_dim(x.size)
     residual = norm(jnp.zeros_like(x).at[0].set(constraint_residual(k)))  # the residual is the length of a vector
     converged = residual <= options.projection_rtol * norm(

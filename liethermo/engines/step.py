@@ -198,7 +198,7 @@ def stage_equations(
     map_function: Callable | None = None,
 ) -> StageEquations:
     """Return the stage equations of a step from x, with a guess extrapolated from the slopes of previous steps."""
-    components = system.solved_subsystem(x)[1]
+    components = system.subsystem_to_solve(x)[1]
     norm = options.norm_for_dim(components.size)
     state_rate = norm(components) / jnp.abs(h)  # computed once per step
     return StageEquations(
@@ -232,7 +232,7 @@ def finish_step(
     failure_code = jnp.where(
         solution.converged | ~solution.is_finite, int(StatusCode.NON_FINITE), int(StatusCode.NOT_CONVERGED)
     )
-    components, end_components = system.solved_subsystem(x)[1], system.solved_subsystem(new_x)[1]
+    components, end_components = system.subsystem_to_solve(x)[1], system.subsystem_to_solve(new_x)[1]
     norm = options.norm_for_dim(components.size)
     # the larger of both ends: a step from rest may start at the state zero
     residual_scale = jnp.maximum(jnp.maximum(norm(components), norm(end_components)), h * solution.slope_rounding)

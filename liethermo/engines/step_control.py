@@ -60,7 +60,7 @@ def arnoldi_hessenberg(system, method, x):
 
     Its eigenvalues approximate the extremal eigenvalues of the Jacobian.
     """
-    system, x = system.solved_subsystem(x)
+    system, x = system.subsystem_to_solve(x)
     jacobian_product, n = _make_jacobian_product(system, x), x.shape[0]
     m = min(n, KRYLOV_DIM)
 
@@ -222,7 +222,7 @@ def jacobian_probe_shape(system: System, method: OneStepMethod, control: StepCon
     if not control.adaptive:
         return 1, 1
     x = jax.ShapeDtypeStruct((system.dim,), jnp.float64)
-    return jax.eval_shape(lambda x: probe_jacobian(*system.solved_subsystem(x)), x).shape
+    return jax.eval_shape(lambda x: probe_jacobian(*system.subsystem_to_solve(x)), x).shape
 
 
 def next_step_size_and_end_time(control: StepControl, adaptive_state: AdaptiveState) -> tuple[jax.Array, jax.Array]:

@@ -48,22 +48,22 @@ class BathEnergy(Energy):
     temperature: jax.Array = eqx.field(metadata=BATH_TEMPERATURE_CONDITION.metadata)
 
     def value(self, x) -> jax.Array:
-        return jnp.sum(self.temperature * _exp_and_expm1_quotient(x * self.rate)[1] * x)
+        return jnp.sum(self.temperature * _exp_and_expm1_quotient(x * self.inverse_capacity)[1] * x)
 
     def gradient(self, x) -> jax.Array:
-        return self.temperature * jnp.exp(x * self.rate)
+        return self.temperature * jnp.exp(x * self.inverse_capacity)
 
     def difference_rounding_scale(self, x) -> jax.Array:
         return jnp.zeros(())
 
     def discrete_gradient(self, scheme, x, d, compensation) -> jax.Array:
         """Return the difference quotient of each bath, the only discrete gradient of a function of one number."""
-        return self.gradient(x + compensation) * _exp_and_expm1_quotient(d * self.rate)[1]
+        return self.gradient(x + compensation) * _exp_and_expm1_quotient(d * self.inverse_capacity)[1]
 
     def stage_gradients(self, scheme, path) -> jax.Array:
         start, k, h, b = path.start + path.compensation, path.slopes, path.h, path.b
         displacements = jnp.concatenate([path.points - start, path.step[None]])
-        exponentials, quotients = _exp_and_expm1_quotient(displacements * self.rate)
+        exponentials, quotients = _exp_and_expm1_quotient(displacements * self.inverse_capacity)
         start_gradient = self.gradient(start)
         gradients, change = start_gradient * exponentials[:-1], start_gradient * quotients[-1] * path.step
         defect, squared_norm = change - h * (b @ (gradients * k)), h * (b @ (k * k))
@@ -71,7 +71,7 @@ class BathEnergy(Energy):
         return gradients + jnp.where(is_zero, 0.0, defect / jnp.where(is_zero, 1.0, squared_norm)) * k
 
     @property
-    def rate(self) -> jax.Array:
+    def inverse_capacity(self) -> jax.Array:
         """Inverse heat capacities 1 / C, shape (m,): the relative change of a temperature per entropy."""
         return 1.0 / self.capacity
 

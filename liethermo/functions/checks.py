@@ -111,6 +111,7 @@ def _check_derivative_of_scatter(energy: Energy, dim: int, role: str) -> None:
 
 
 def _is_traced_function(leaf) -> bool:
+    """Return whether a leaf of a pytree is a function that has been traced already."""
     return isinstance(leaf, TracedFunction)
 
 

@@ -59,6 +59,7 @@ class ParameterCondition(NamedTuple):
         return {int(i): condition_message(template, values[i]) for i in np.flatnonzero(~holds & ~has_nan)}
 
     def _test_and_template(self, ndim: int) -> tuple[Callable, str]:
+        """Return the test of values with ``ndim`` axes, and the template of its message."""
         if ndim == 2 and self.matrix_test is not None:
             return self.matrix_test, self.matrix_template
         return self.test, self.template
@@ -89,12 +90,14 @@ def semidefinite_condition(name: str, symmetric: bool = True) -> ParameterCondit
 
 
 def _are_symmetric_and_semidefinite(matrices):
+    """Return whether matrices, shape (..., n, n), are symmetric and positive semidefinite to rounding."""
     xp = np if isinstance(matrices, np.ndarray) else jnp
     asymmetry = xp.abs(matrices - xp.swapaxes(matrices, -1, -2)).max(axis=(-2, -1))
     return _are_semidefinite(matrices) & (asymmetry <= 1e-12 * xp.abs(matrices).max(axis=(-2, -1)))
 
 
 def _are_semidefinite(matrices):
+    """Return whether the symmetric parts of matrices, shape (..., n, n), are positive semidefinite to rounding."""
     xp = np if isinstance(matrices, np.ndarray) else jnp
     eigenvalues = xp.linalg.eigvalsh(0.5 * (matrices + xp.swapaxes(matrices, -1, -2)))
     return eigenvalues[..., 0] >= -1e-12 * matrices.shape[-1] * xp.abs(matrices).max(axis=(-2, -1))

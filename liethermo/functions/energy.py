@@ -508,6 +508,7 @@ class Pullback(Energy):
 
     @property
     def _selects_components(self) -> bool:
+        """True if the coordinates are components of the state, reordered or scaled."""
         return isinstance(self.coordinates, ComponentMap)
 
     @property

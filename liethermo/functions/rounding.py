@@ -123,6 +123,7 @@ class Perturbation:
         return self._errors[key]
 
     def _sum_of_patterns(self, shape: tuple[int, ...], pattern_number: int) -> jax.Array:
+        """Return the sum of random arrays of a shape, each times its amplitude."""
         pattern = _stored_random_numbers if math.prod(shape) <= MAX_STORED_PATTERN_LENGTH else _pseudorandom_numbers
         errors = [
             amplitude * pattern(shape, (pattern_number + PERTURBATION_SAMPLES * i) % PATTERNS_PER_SHAPE)

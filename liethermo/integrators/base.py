@@ -258,8 +258,9 @@ class TransportingMethod(OneStepMethod):
         """
 
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
-        """Return the velocities at the stages, shape (stages, n): :meth:`.System.driving_covector` at
-        the gradients of the step.
+        """Return the velocities of an attitude at the stages, shape (stages, n), from the gradients of the step.
+
+        They are those of :meth:`.System.attitude_velocity_from_gradients`.
 
         An explicit method has none: an attitude follows its steps by angles of their own.
         """

@@ -111,13 +111,15 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
         z, dH, dS, dL = self.method.midpoint_and_gradients(system, x, compensation, h, k)
         factors_and_inputs = self._factors_and_drift_plus_noise(system, z, dH, dL, h)
         return sum(
-            (B.velocity(w) for B, w in factors_and_inputs if B.velocity), start=system.driving_covector(z, dH, dS, dL)
+            (B.added_attitude_velocity(w) for B, w in factors_and_inputs if B.added_attitude_velocity),
+            start=system.attitude_velocity_from_gradients(z, dH, dS, dL),
         )[None]
 
     def can_transport_attitude(self, system: System) -> bool:
         point = jnp.asarray(system.samples(1)[0])
         return all(
-            B.velocity is not None for _, B in terms_with_factors_at_state(system.total_dissipation, system, point)
+            B.added_attitude_velocity is not None
+            for _, B in terms_with_factors_at_state(system.total_dissipation, system, point)
         )
 
     def _factors_and_drift_plus_noise(self, system: System, z, dH, dL, h) -> list[tuple[Factor, jax.Array]]:

@@ -22,7 +22,7 @@ from ..functions.energy import Energy
 from ..functions.frames import OrthonormalFrame, gram_schmidt
 from ..functions.gradients import CorrectionDirection, FunctionChange, correct_gradients, discrete_gradients_at_stages
 from ..systems import System
-from ..systems.invariants import number_preserved_functions, preserved_function_names, stack_gradients
+from ..systems.invariants import preserved_function_names, preserved_functions_by_number, stack_gradients
 from ..systems.transport import has_generator
 from ..tracing.interpret import evaluate_at_points
 from .base import (
@@ -234,10 +234,12 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         return None if points is None else jax.vmap(system.poisson.sharp)(points, dH)
 
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
-        names = tuple(number_preserved_functions(system))
+        names = tuple(preserved_functions_by_number(system))
 
         def velocity(u, dH, dS, gradients_by_name):
-            return system.driving_covector(u, dH, dS, tuple(gradients_by_name[name].discrete for name in names))
+            return system.attitude_velocity_from_gradients(
+                u, dH, dS, tuple(gradients_by_name[name].discrete for name in names)
+            )
 
         return jax.vmap(velocity)(*self._stages_and_gradients(system, x, compensation, h, k))
 
@@ -259,7 +261,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         gradients_by_name = {
             name: discrete_and_continuous_gradients(C)
             for name, C in (
-                self._held_functions(system) | entropy_functions | number_preserved_functions(system)
+                self._held_functions(system) | entropy_functions | preserved_functions_by_number(system)
             ).items()
         }
         if S is None:
@@ -287,7 +289,9 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         """Return the slope of one stage, ``Pi_d dH + K_d dS`` with discrete Poisson and friction matrices."""
         system = system.cache_tensors_at(u)
         slope = self._conservative_slope(system, u, dH, gradients_by_name)
-        keys_and_names = tuple(zip(number_preserved_functions(system), preserved_function_names(system), strict=True))
+        keys_and_names = tuple(
+            zip(preserved_functions_by_number(system), preserved_function_names(system), strict=True)
+        )
         for term, preserved_keys in terms_with_preserved_values(system.total_dissipation.terms, keys_and_names):
             slope = slope + self._dissipative_slope(term, preserved_keys, system, u, dH, dS, gradients_by_name)
         return slope

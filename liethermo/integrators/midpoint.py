@@ -83,7 +83,9 @@ class MetriplecticMidpoint(TransportingMethod):
         return z, dH, dS, dL
 
     def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
-        return system.driving_covector(*self.midpoint_and_gradients(system, x, compensation, h, k))[None]
+        return system.attitude_velocity_from_gradients(*self.midpoint_and_gradients(system, x, compensation, h, k))[
+            None
+        ]
 
     def can_transport_attitude(self, system: System) -> bool:
         return True

@@ -16,7 +16,7 @@ from ..errors import InputError
 from ..functions.frames import vector_with_inner_products
 from ..functions.gradients import two_sum
 from ..systems import MOMENTUM_LESS_IMPULSE, SPATIAL_MOMENTUM, AttitudeChartSystem, AttitudeSystem
-from ..systems.transport import moves_by_transport_alone
+from ..systems.transport import dissipation_keeps_spatial_momentum
 from .base import MethodWrapper, TransportingMethod, pullback_method
 from .explicit import StepRow
 from .tableaus import gauss_tableau
@@ -30,8 +30,8 @@ class WithAttitude(MethodWrapper):
 
     The momentum follows the inner method alone, with tolerances for the momentum alone. The attitude is then computed
     from the velocities xi_i at the stages without an iteration, so it does not depend on the units of the momentum. xi
-    is the discrete gradient of the energy plus the velocity of internal friction
-    [:meth:`liethermo.Dissipation.velocity`].
+    is the discrete gradient of the energy plus the velocity that internal friction adds
+    [:meth:`liethermo.Dissipation.added_attitude_velocity`].
 
     ``"cayley"`` is Gauss collocation on the matrices, ``G_i = g + h sum_j A_ij G_j hat(xi_j)``: with one stage ``g' = g
     cayley(h xi)``. It preserves quadratic properties of g: that g is orthogonal, unitary or symplectic.
@@ -115,7 +115,7 @@ class WithAttitude(MethodWrapper):
 
     def start(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
         if not self.explicit:
-            return self.method.start(system.body_at_attitude(x), system.body_states(x))
+            return self.method.start(system.body_at_attitude_of_state(x), system.body_states(x))
         mu, g = system.attitude_layout.split_state(x)
         local, n = AttitudeChartSystem(system, self.order, g), system.group.dim
         k = self.method.start(
@@ -127,7 +127,7 @@ class WithAttitude(MethodWrapper):
 
     def error(self, system: AttitudeSystem, x, compensation, h, k) -> jax.Array:  # type: ignore[override]
         return self.method.error(
-            system.body_at_attitude(x),
+            system.body_at_attitude_of_state(x),
             system.body_states(x),
             system.body_states(compensation),
             h,
@@ -188,7 +188,8 @@ class WithAttitude(MethodWrapper):
         local, step = AttitudeChartSystem(system, self.order, g), self.increment(h, k)
         new_g = g @ group.exp_map(group.algebra, local.rotation_angles(step))
         keeps_orbit, p_compensation = (
-            moves_by_transport_alone(system.body) and self._checked_inner_method.can_transport_attitude(system.body),
+            dissipation_keeps_spatial_momentum(system.body)
+            and self._checked_inner_method.can_transport_attitude(system.body),
             None,
         )
         if system.impulse_dim:

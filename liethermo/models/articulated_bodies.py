@@ -596,10 +596,10 @@ class JointDamping(Dissipation):
             jnp.zeros_like(dH).at[self._momenta_along_screws].set(-self.coefficients * dH[self._momenta_along_screws])
         )
 
-    def velocity(self, system, x, dH, dS, dL):
+    def added_attitude_velocity(self, system, x, dH, dS, dL):
         return jnp.zeros_like(dH)
 
     def factor(self, system, x, dH, dL):
         root, momenta = jnp.sqrt(self.coefficients), self._momenta_along_screws
         momentum_rates = lambda w: jnp.zeros_like(x).at[momenta].set(root * w)  # noqa: E731
-        return Factor(root.shape[0], momentum_rates, True, velocity=lambda w: jnp.zeros_like(x))
+        return Factor(root.shape[0], momentum_rates, True, added_attitude_velocity=lambda w: jnp.zeros_like(x))

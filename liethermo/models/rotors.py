@@ -49,7 +49,7 @@ class BearingFriction(Damping):
         rates = dH[3 : 3 + self._n_rotors]
         return jnp.zeros_like(x).at[3 : 3 + self._n_rotors].set(-self.friction * rates)
 
-    def velocity(self, system, x, dH, dS, dL):
+    def added_attitude_velocity(self, system, x, dH, dS, dL):
         return jnp.zeros_like(dH)
 
     def factor(self, system, x, dH, dL):
@@ -57,10 +57,10 @@ class BearingFriction(Damping):
         zero_velocity = lambda w: jnp.zeros_like(x)  # noqa: E731
         if self.friction.ndim == 0:
             momentum_rate = lambda w: jnp.zeros_like(x).at[3].set(w[0])  # noqa: E731
-            return Factor(1, momentum_rate, True, velocity=zero_velocity).scale_by(self.friction)
+            return Factor(1, momentum_rate, True, added_attitude_velocity=zero_velocity).scale_by(self.friction)
         roots = sqrt_or_zero(self.friction)
         momentum_rates = lambda w: jnp.zeros_like(x).at[3 : 3 + n].set(roots * w)  # noqa: E731
-        return Factor(n, momentum_rates, True, velocity=zero_velocity)
+        return Factor(n, momentum_rates, True, added_attitude_velocity=zero_velocity)
 
 
 class RotorFriction(Damping):
@@ -85,14 +85,14 @@ class RotorFriction(Damping):
         return jnp.append(torque, jnp.dot(self.axis, torque))
 
     def force(self, system, x, dH, dS, dL):
-        return self._momentum_rate(x, self.velocity(system, x, dH, dS, dL)[:3])
+        return self._momentum_rate(x, self.added_attitude_velocity(system, x, dH, dS, dL)[:3])
 
-    def velocity(self, system, x, dH, dS, dL):
+    def added_attitude_velocity(self, system, x, dH, dS, dL):
         return jnp.append(self.rate * jnp.cross(x[:3], dH[:3] + dH[3] * self.axis), 0.0)
 
     def factor(self, system, x, dH, dL):
         momentum_rate = lambda w: self._momentum_rate(x, w)  # noqa: E731
-        return Factor(3, momentum_rate, velocity=lambda w: jnp.append(w, 0.0)).scale_by(self.rate)
+        return Factor(3, momentum_rate, added_attitude_velocity=lambda w: jnp.append(w, 0.0)).scale_by(self.rate)
 
 
 def damper_wheel(

@@ -243,11 +243,11 @@ class _MemberInvariantTests:
         )
 
     def facts_from_multiples_and_verdicts(
-        self, multiple_indices: np.ndarray, verdict_row: np.ndarray
+        self, proportional_indices: np.ndarray, verdict_row: np.ndarray
     ) -> InvariantFacts:
         """Return the invariant facts of a member, from its row of indices of proportional functions and of verdicts."""
         member = self.member
-        names = name_preserved_functions(member, multiple_indices.tolist())
+        names = name_preserved_functions(member, proportional_indices.tolist())
         truth_values = {VERDICT_UNKNOWN: None, VERDICT_NOT_CONSERVED: False, VERDICT_CONSERVED: True}
         verdicts: dict[str, bool | None] = {}
         for name, verdict in zip((*names, *self.casimirs), np.roll(verdict_row, len(names)).tolist(), strict=True):

@@ -173,7 +173,7 @@ def why_not_startable(system: System, method, x) -> str:
     """Return the reason why no run can start at x, a state or a batch of states; "" if a run can start."""
     ignores_singularity = has_generator(system) and (not isinstance(method, OneStepMethod) or method.explicit)
     domain = system.domain
-    reason = domain.why_outside(x) or ("" if ignores_singularity else domain.why_singular(x))
+    reason = domain.why_outside(x) or ("" if ignores_singularity else domain.why_entropy_gradient_infinite(x))
     return reason and f"the run cannot start at this x0: {reason}"
 
 
@@ -275,7 +275,7 @@ def promised_laws(system: System, method, invariants) -> Laws:
             energy,
             None,
             conserved_names,
-            tuple(system.ledger),
+            tuple(system.ledger_functions),
             (),
             balance_entries,
             unpromised_names,
@@ -285,6 +285,6 @@ def promised_laws(system: System, method, invariants) -> Laws:
     quadratic = system.entropy is not None and system.entropy.is_quadratic
     exact = {"energy": {"energy"}, "entropy": {"entropy_law", *(["entropy_law_quadratic"] if quadratic else [])}}
     inexact = tuple(law for law, claims in exact.items() if not claims & method.preserves)
-    ledger = tuple(system.ledger)
+    ledger = tuple(system.ledger_functions)
     law_names = system.energy_law, system.entropy_law
     return Laws(*law_names, conserved_names, ledger, inexact, balance_entries, unpromised_names, unknown=unknown)

@@ -49,7 +49,12 @@ class RecordedFunctions(NamedTuple):
         """Return the recorded functions of a system, from the result of :func:`.preparation.invariants_and_laws`."""
         functions = {name: f for name, (f, _) in invariants.items()}
         has_user_states = type(system).to_user_solution is System.to_user_solution and not system.sites
-        return cls(functions, {**functions, **system.ledger}, has_user_states, tuple(system.body_kinematics.velocities))
+        return cls(
+            functions,
+            {**functions, **system.ledger_functions},
+            has_user_states,
+            tuple(system.body_kinematics.velocities),
+        )
 
 
 def build_solution(

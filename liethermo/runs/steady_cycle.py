@@ -20,7 +20,7 @@ from ..results.solution import Solution
 from ..systems import System
 from ..systems.invariants import stack_gradients
 from ..systems.kind_checks import require_system
-from ..systems.linearisation import conserved_functions, heat_counter_indices
+from ..systems.linearisation import conserved_functions, constant_temperature_entropy_indices
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.programs import jit_unoptimised
 from .propagator import Propagator
@@ -170,7 +170,7 @@ def steady_cycle(
         raise InputError(f"period must be a positive number, got {period!r}")
     _check_periodicity(system, float(period), start)
     x = np.array(system.steady_state_guess() if x0 is None else system.state(x0))
-    counters = heat_counter_indices(system)
+    counters = constant_temperature_entropy_indices(system)
     mapped_components = np.setdiff1d(np.arange(system.dim), counters)
     x[counters] = 0.0
     span, propagator = (start, start + float(period)), Propagator(system, method, step)

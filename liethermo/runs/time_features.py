@@ -150,7 +150,7 @@ def _locate_jump(system: System, x: np.ndarray, scale: np.ndarray, start: float,
 
 def _energy_gradient_and_torque(system: System, x) -> jax.Array:
     """Return the gradient of the energy by the state of the body, and the torque if there is one, in one array."""
-    body, y = system.solved_subsystem(x)
+    body, y = system.subsystem_to_solve(x)
     gradient = body.energy.gradient(y)[:-2]
     torque = body.external_torque(y)
     return gradient if torque is None else jnp.concatenate([gradient, torque])

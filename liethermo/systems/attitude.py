@@ -27,7 +27,7 @@ from .kind_checks import require_kind, unwrap_user_system
 from .lie_poisson import LiePoissonSystem
 from .lifted import LiftedSystem
 from .rotations import attitude_array
-from .transport import moves_by_transport_alone
+from .transport import dissipation_keeps_spatial_momentum
 
 SPATIAL_MOMENTUM = "momentum in space"
 """Name of the constant of the motion ``Ad_star(inverse(g), mu)``."""
@@ -68,8 +68,8 @@ class AttitudeSystem(LiftedSystem):
         self.body, self.reconstruction, self.group, self.space = body, reconstruction, group, None
         self.dim = self.attitude_layout.impulse_start + self.impulse_dim
         self.poisson, self.dissipation, self.momentum_maps = body.poisson, body.dissipation, {}
-        self.energy = self.extend(body.energy)
-        self.entropy = None if body.entropy is None else self.extend(body.entropy)
+        self.energy = self.lift_energy(body.energy)
+        self.entropy = None if body.entropy is None else self.lift_energy(body.entropy)
         self.preserved_labels, self.invariant_verdicts = body.preserved_labels, body.invariant_verdicts
 
     @property
@@ -101,12 +101,12 @@ class AttitudeSystem(LiftedSystem):
         clock = self.body.clock
         return clock and replace_fields(clock, n_trailing_counters=self.impulse_dim)
 
-    def body_at_attitude(self, x) -> LiePoissonSystem | DrivenSystem:
+    def body_at_attitude_of_state(self, x) -> LiePoissonSystem | DrivenSystem:
         """Return the body with its torque bound to the attitude of a state."""
         return self.body.bind_attitude(self.attitude_layout.split_state(x)[1])
 
-    def solved_subsystem(self, x) -> tuple[System, jax.Array]:
-        return self.body_at_attitude(x), self.body_states(x)
+    def subsystem_to_solve(self, x) -> tuple[System, jax.Array]:
+        return self.body_at_attitude_of_state(x), self.body_states(x)
 
     def momentum_to_space_matrix(self, g) -> jax.Array:
         """Return the matrix A, shape (..., n, n), that maps a body momentum to space, ``mu @ A``, at the attitude g."""
@@ -193,7 +193,7 @@ class AttitudeSystem(LiftedSystem):
 
     @property
     def vector_invariant_names(self):
-        if not moves_by_transport_alone(self.body):
+        if not dissipation_keeps_spatial_momentum(self.body):
             return ()
         return (MOMENTUM_LESS_IMPULSE,) if self.impulse_dim else (SPATIAL_MOMENTUM,)
 
@@ -208,8 +208,8 @@ class AttitudeSystem(LiftedSystem):
         return tuple(f"{IMPULSE_NAME} {i + 1}" for i in range(self.impulse_dim))
 
     @property
-    def ledger(self):
-        body_ledger = {name: self.extend(f) for name, f in self.body.ledger.items()}
+    def ledger_functions(self):
+        body_ledger = {name: self.lift_energy(f) for name, f in self.body.ledger_functions.items()}
         return body_ledger | {
             name: Linear(jnp.ones(1)).on([i - self.group.dim]) for i, name in enumerate(self.impulse_names)
         }
@@ -221,15 +221,15 @@ class AttitudeSystem(LiftedSystem):
 
     def attitude_velocity(self, x) -> jax.Array:
         """Return the velocity xi of the attitude at a state, ``g' = g hat(xi)``, shape (group.dim,)."""
-        mu, body = self.body_states(x), self.body_at_attitude(x)
+        mu, body = self.body_states(x), self.body_at_attitude_of_state(x)
         dS = body.entropy_gradient(mu)
-        xi = body.driving_covector(
+        xi = body.attitude_velocity_from_gradients(
             mu, body.energy.gradient(mu), dS, tuple(L.gradient(mu) for L in body.preserved_functions)
         )
         return xi[: self.group.dim]
 
     def _vector_field(self, x):
-        (mu, g), body = self.attitude_layout.split_state(x), self.body_at_attitude(x)
+        (mu, g), body = self.attitude_layout.split_state(x), self.body_at_attitude_of_state(x)
         p = body.external_torque(mu)[: self.group.dim] @ self.momentum_to_space_matrix(g) if self.impulse_dim else None
         return self.attitude_layout.join_state(
             body._vector_field(mu), g @ self.group.algebra.hat(self.attitude_velocity(x)), p
@@ -255,6 +255,7 @@ def momentum_system_of(body: System) -> LiePoissonSystem:
 
 
 def _attitude_residual(system: AttitudeSystem, x) -> jax.Array:
+    """Return the relative distance of the attitude of one state from the group, shape ()."""
     return system.group.defect(system.attitude_layout.split_state(x)[1])
 
 
@@ -310,12 +311,12 @@ class AttitudeChartSystem(LiftedSystem):
         return *_body_block_slices(self.inner_system), slice(n, m), *([slice(m, None)] if m < self.dim else [])
 
     def pullback(self, energy: Energy) -> Energy:
-        return self.extend(energy)
+        return self.lift_energy(energy)
 
     def field(self, x, dH, dS, dL=()):
         body, arguments = self.inner_system_at(x), self.restrict_to_inner_state(x, dH, dS, dL)
         algebra = self.attitude_system.group.algebra
-        velocity = body.driving_covector(*arguments)[: algebra.dim]
+        velocity = body.attitude_velocity_from_gradients(*arguments)[: algebra.dim]
         angle_rates = maps.inverse_dexp(algebra, self.rotation_angles(x), velocity, self.order)
         rates = [body.field(*arguments), ANGLE_UNIT * angle_rates]
         if self.torque_laws.has_impulse:
@@ -332,6 +333,7 @@ class AttitudeChartSystem(LiftedSystem):
         return body.bind_attitude(self._attitude_at(x)) if body.torque_laws.needs_attitude else body
 
     def _attitude_at(self, x) -> jax.Array:
+        """Return the attitude matrix, shape (m, m), at coordinates x of the chart."""
         group = self.attitude_system.group
         return self.attitude @ group.exp_map(group.algebra, self.rotation_angles(x))
 

@@ -31,7 +31,7 @@ from .conservation import project_covector
 from .interface import SystemInterface
 from .invariants import candidate_invariants, find_invariants, find_preserved_function_names
 from .states import checked_state_array, evaluate_batch, reshape_to_sites
-from .transport import dissipation_velocities, generator_field, has_generator
+from .transport import added_attitude_velocities, generator_field, has_generator
 
 
 class System(SystemInterface):
@@ -113,23 +113,23 @@ class System(SystemInterface):
             self.entropy = None if self.entropy is None else with_polynomial_degrees(self.entropy, dim)
             self.momentum_maps = {name: with_polynomial_degrees(J, dim) for name, J in self.momentum_maps.items()}
 
-        def drives_baths(term: Dissipation) -> bool:
+        def needs_bath_entropies(term: Dissipation) -> bool:
             return term.acts_on_baths_alone or (self.entropy is None and term.needs_entropy)
 
         terms = dissipation_terms(dissipation)
-        bath_terms = tuple(term for term in terms if drives_baths(term))
-        dissipation = sum_dissipations([term for term in terms if not drives_baths(term)] or None)
+        bath_terms = tuple(term for term in terms if needs_bath_entropies(term))
+        dissipation = sum_dissipations([term for term in terms if not needs_bath_entropies(term)] or None)
         for term in bath_terms:
             if not baths.number:
                 raise InputError(
                     f"{type(term).__name__} acts on baths. Give the system baths=lt.HeatBaths(...)"
                     if term.acts_on_baths_alone
-                    else f"{type(term).__name__} drives the entropy up, so the system needs an entropy"
+                    else f"{type(term).__name__} increases the entropy, so the system needs one. Give entropy="
                 )
-            if not term.can_drive_baths:
+            if not term.can_act_on_baths:
                 raise InputError(
-                    f"{type(term).__name__} drives the entropy of the body up, which it needs beside the entropies of "
-                    "its baths. Give entropy="
+                    f"{type(term).__name__} increases the entropy of the body, which has none besides the entropies "
+                    "of its baths. Give entropy="
                 )
         self.dissipation = None
         if dissipation is not None:
@@ -244,15 +244,15 @@ class System(SystemInterface):
         dH, dL = system.energy.gradient(x), tuple(L.gradient(x) for L in dissipation.preserve)
         return jax.jacfwd(lambda dS: dissipation.force(system, x, dH, dS, dL))(jnp.zeros(self.dim))
 
-    def driving_covector(self, x, dH, dS, dL=()) -> jax.Array:
-        """Return the covector, shape (body_dim,), that Pi maps to the velocity of the body without torques.
+    def attitude_velocity_from_gradients(self, x, dH, dS, dL=()) -> jax.Array:
+        """Return the velocity xi of an attitude, ``g' = g hat(xi)``, shape (body_dim,), from continuous or discrete
+        gradients.
 
-        It is dH plus the velocities of the dissipations [:meth:`liethermo.Dissipation.velocity`], for the body without
-        baths; the gradients are continuous or discrete. On a Lie algebra the attitude g obeys
-        ``g' = g hat(xi)``, where xi is this covector.
+        It is dH plus :meth:`liethermo.Dissipation.added_attitude_velocity` of each dissipation, for the body without
+        baths. Without external torques the motion of the body is ``Pi(x) xi``, except for internal momenta.
         """
         total = dH[: self.body_dim]
-        for sigma in dissipation_velocities(self, x, dH, dS, dL):
+        for sigma in added_attitude_velocities(self, x, dH, dS, dL):
             total = total if sigma is None else total + sigma
         return total
 
@@ -265,8 +265,8 @@ class System(SystemInterface):
         """
         return self, x
 
-    def solved_subsystem(self, x) -> tuple[System, jax.Array]:
-        """Return the subsystem whose equations a step solves, and its part of the state x; the rest follows from it.
+    def subsystem_to_solve(self, x) -> tuple[System, jax.Array]:
+        """Return the subsystem whose equations a step solves, and the components of x that are its state.
 
         Slopes and errors have its dimension. The other components follow from it, and have tolerances of their own.
         """
@@ -277,13 +277,13 @@ class System(SystemInterface):
         return reshape_to_sites(self, solution)
 
     def cache_tensors_at(self, x) -> System:
-        """Return the system for use at the state x only, with parts that Pi and K share computed once."""
+        """Return the system for use at one state x, with the tensors that Pi and K share computed in advance."""
         return self
 
     # -- functions and laws -------------------------------------------------------------------------------------------
 
     def functions(self) -> dict[str, Energy]:
-        """Return momentum maps, functions that the dissipation preserves, and Casimirs, by name, each quantity once."""
+        """Return the functions that may be conserved, by name: momentum maps, preserved functions and Casimirs."""
         return candidate_invariants(self)
 
     @with_library_settings
@@ -337,6 +337,7 @@ class System(SystemInterface):
         return check_system(self, points, samples, seed, scale, times)
 
     def _vector_field(self, x) -> jax.Array:
+        """Return the vector field at one state, shape (n,), from the exact gradients of all functions."""
         if has_generator(self):
             return generator_field(self, x)
         dS = jnp.zeros_like(x) if self.entropy is None else self.entropy.gradient(x)
@@ -352,14 +353,16 @@ def _bind_dissipation(system: System, dissipation: Dissipation) -> Dissipation:
 
 
 def _attach_baths(system: System, baths: HeatBaths, bath_terms: tuple[Dissipation, ...]) -> None:
-    """Append baths to a system in place; the dissipations ``bath_terms`` act on the extended states."""
+    """Append baths to a system in place, with the dissipations ``bath_terms``, which act on the extended states."""
     body, n, m = copy(system), system.dim, baths.number
 
-    def extend(energy: Energy) -> Energy:
+    def lift_energy(energy: Energy) -> Energy:
         return energy.on(range(n))
 
     if system.dissipation is not None or not bath_terms:
-        system.dissipation = couple_to_baths(system.total_dissipation, body, m, baths.has_positive_temperatures, extend)
+        system.dissipation = couple_to_baths(
+            system.total_dissipation, body, m, baths.has_positive_temperatures, lift_energy
+        )
     if body.space is not None and body.space.dtype.kind == "c":
         raise InputError(f"baths need a real space, but {body.space.name} is complex")
     system.baths, system.dim = baths, n + m
@@ -367,8 +370,8 @@ def _attach_baths(system: System, baths: HeatBaths, bath_terms: tuple[Dissipatio
     system.poisson = poisson_with_baths(body.poisson, m)
     system.energy = BodyBathsEnergy(body.energy, baths.energy, n, system.dim)
     heat = BathEntropy(m)
-    system.entropy = heat if body.entropy is None else extend(body.entropy) + heat
-    system.momentum_maps = {name: extend(J) for name, J in body.momentum_maps.items()}
+    system.entropy = heat if body.entropy is None else lift_energy(body.entropy) + heat
+    system.momentum_maps = {name: lift_energy(J) for name, J in body.momentum_maps.items()}
     if bath_terms:
         bound_terms = tuple(_bind_dissipation(system, term) for term in bath_terms)
         system.dissipation = sum_dissipations((*system.total_dissipation.terms, *bound_terms))

@@ -152,7 +152,7 @@ class HeatBaths(Module):
 
 
 class _AbsentBaths(HeatBaths):
-    """Zero baths, which a system without baths has."""
+    """The baths of a system without baths: none."""
 
     def __init__(self):
         self.energy, self.number = ZeroEnergy(), 0
@@ -199,8 +199,8 @@ class _EntryOfFunction(Module):
 def _checked_temperature_function(function: Callable, index: int) -> Callable:
     """Return a checked function of time whose value is the temperature of a bath; NaN where it is not positive."""
     what = f"the temperature of bath {index}"
-    traced, _ = traced_function_and_shape(function, ((),), [()], what, "a time")
-    return _PositiveTemperature(traced)
+    traced_function, _ = traced_function_and_shape(function, ((),), [()], what, "a time")
+    return _PositiveTemperature(traced_function)
 
 
 class _PositiveTemperature(Module):

@@ -22,17 +22,17 @@ TEMPERATURE_RTOL = 1e-9
 """Relative difference up to which a temperature counts as that of a bath whose temperature cannot change."""
 
 
-def is_given_by_velocity(system, x, angular_velocity, alternative: str, **velocity_arguments) -> bool:
-    """Return whether a state is given by an angular velocity, and not by x.
+def is_state_given_by_velocity(system, x, angular_velocity, alternative: str, **velocity_arguments) -> bool:
+    """Return whether the user gives a state by an angular velocity, and not by x; check that one of them is given.
 
     Parameters
     ----------
     system : LiePoissonSystem or EulerPoincareClosedSystem
     x, angular_velocity
-        What the user gave, or None.
+        Arguments of the user, or None.
     alternative : str
-        What to give for a system without an angular velocity.
-    **details
+        Argument that the message recommends for a system without an angular velocity.
+    **velocity_arguments
         Arguments that belong to an angular velocity, or None.
 
     Raises
@@ -96,7 +96,7 @@ def append_bath_entropies(body_state, baths: HeatBaths, temperature) -> jax.Arra
         return body_state
     if not baths.number:
         raise InputError("temperature= needs a system with baths. Build the system with baths=lt.HeatBaths(...)")
-    return jnp.concatenate(broadcast_batches(body_state, entropies_of_temperatures(baths, temperature)), axis=-1)
+    return jnp.concatenate(broadcast_batches(body_state, bath_entropies_at_temperature(baths, temperature)), axis=-1)
 
 
 def momentum_of_velocity(energy: Energy, velocity) -> jax.Array:
@@ -139,7 +139,7 @@ def _momentum_of_quadratic(energy: Quadratic, velocity) -> jax.Array:
     return rest / A if A.ndim == 1 else jnp.linalg.solve(A, rest[..., None])[..., 0]
 
 
-def entropies_of_temperatures(baths: HeatBaths, temperature) -> jax.Array:
+def bath_entropies_at_temperature(baths: HeatBaths, temperature) -> jax.Array:
     """Return the entropies of the baths, shape (..., number), at one temperature for all or one for each.
 
     Raises

@@ -188,7 +188,7 @@ def _momentum_map_row(system: Any, name: str, residuals: np.ndarray) -> CheckRow
 
 
 def _indefiniteness(K: np.ndarray) -> float:
-    """Return how far K is from semidefinite: its lowest eigenvalue, if negative, over its largest entry."""
+    """Return the modulus of the lowest eigenvalue of K over its largest entry; 0 if no eigenvalue is negative."""
     scale = np.abs(K).max()
     if not 0.0 < scale < np.inf:
         return 0.0 if scale == 0.0 else np.nan
@@ -307,9 +307,9 @@ def _sampled_jacobi_residual(poisson: Any, x) -> jax.Array:
     """Return the residual of Jacobi's identity for three random linear functions, relative to its largest term."""
     covectors = np.random.default_rng(0).standard_normal((3, x.size))
 
-    def term(f, g, h):
+    def cyclic_term(f, g, h):
         return jax.jvp(lambda y: jnp.dot(g, poisson.sharp(y, h)), (x,), (poisson.sharp(x, f),))[1]
 
-    terms = jnp.stack([term(*np.roll(covectors, i, axis=0)) for i in range(3)])
+    terms = jnp.stack([cyclic_term(*np.roll(covectors, i, axis=0)) for i in range(3)])
     max_term = jnp.max(jnp.abs(terms))
     return jnp.abs(jnp.sum(terms)) / jnp.where(max_term > 0.0, max_term, 1.0)

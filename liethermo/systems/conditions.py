@@ -37,12 +37,12 @@ class RunCondition:
 
 
 def worst_conditions(conditions_of_runs: Iterable[Iterable[RunCondition]]) -> tuple[RunCondition, ...]:
-    """Return one condition per name, the worst among several runs."""
+    """Return for each name the condition with the worst value among several runs."""
     worst_by_name: dict[str, RunCondition] = {}
     for condition in (condition for conditions in conditions_of_runs for condition in conditions):
-        worst_so_far = worst_by_name.setdefault(condition.name, condition)
+        current_worst = worst_by_name.setdefault(condition.name, condition)
         is_worse = (
-            condition.value < worst_so_far.value if condition.is_minimum else condition.value > worst_so_far.value
+            condition.value < current_worst.value if condition.is_minimum else condition.value > current_worst.value
         )
         if is_worse or not math.isfinite(condition.value):
             worst_by_name[condition.name] = condition

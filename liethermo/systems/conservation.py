@@ -63,7 +63,7 @@ def function_rates_of_change(system_and_functions: tuple[SystemInterface, tuple[
     rates = jnp.where(is_defined[:, None], rates, jnp.nan)
     for i, dissipation in enumerate(system.total_dissipation.terms, start=1):
         if dissipation.preserve:  # by construction, wherever it is defined
-            is_preserved = _is_spanned(gradients, [L.gradient(x) for L in dissipation.preserve])
+            is_preserved = _are_in_span(gradients, [L.gradient(x) for L in dissipation.preserve])
             rates = rates.at[i].set(jnp.where(is_preserved, 0.0, rates[i]))
     scales = jnp.stack(speeds)[:, None] * jnp.linalg.norm(gradients, axis=1)
     return InvariantRates(rates, jnp.where(rates == 0.0, 1.0, scales))
@@ -79,7 +79,7 @@ def project_covector(system: SystemInterface, x, alpha) -> jax.Array:
     return alpha if system.space is None else system.lower_index(x, system.raise_index(x, alpha))
 
 
-def _is_spanned(gradients, vectors) -> jax.Array:
+def _are_in_span(gradients, vectors) -> jax.Array:
     """Return for each gradient, shape (m, n), whether it is a linear combination of some vectors: bools, shape (m,)."""
     project_off = gram_schmidt(vectors).project_off
     remainders = jnp.stack([project_off(gradient) for gradient in gradients])
@@ -113,9 +113,9 @@ def judge_conservation(rates: InvariantRates, tolerance: float = AXIOM_TOLERANCE
     """
     values, scales = rates
     with np.errstate(invalid="ignore"):
-        each_vanishes = (abs(values) <= tolerance * scales).all(axis=-2)
+        all_parts_vanish = (abs(values) <= tolerance * scales).all(axis=-2)
         sum_vanishes = abs(values.sum(axis=-2)) <= tolerance * abs(values).max(axis=-2)
-    return PointwiseVerdicts((abs(values) < np.inf).all(axis=-2), each_vanishes | sum_vanishes)
+    return PointwiseVerdicts((abs(values) < np.inf).all(axis=-2), all_parts_vanish | sum_vanishes)
 
 
 def is_proportional(f: np.ndarray, g: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ class Domain:
         The conditions in words, such as "positive temperatures".
     why_outside : function from states, shape (n,) or (..., n), to str
         Explains why a state lies outside of the domain; "" if all lie inside.
-    why_singular : function from states, shape (n,) or (..., n), to str
+    why_entropy_gradient_infinite : function from states, shape (n,) or (..., n), to str
         Explains why the gradient of the entropy is infinite at a state, so that no run can start there; "" if it is
         finite at all states.
     margin : function from a state, shape (n,), to a number; optional
@@ -34,13 +34,13 @@ class Domain:
 
     description: str = ""
     why_outside: Callable[[Any], str] = _empty_reason
-    why_singular: Callable[[Any], str] = _empty_reason
+    why_entropy_gradient_infinite: Callable[[Any], str] = _empty_reason
     margin: Callable[[Any], jax.Array] | None = None
 
     @property
     def allows_every_start(self) -> bool:
         """True if a run may start at every finite state."""
-        return self.why_outside == _empty_reason and self.why_singular == _empty_reason
+        return self.why_outside == _empty_reason and self.why_entropy_gradient_infinite == _empty_reason
 
     def margin_at(self, x) -> jax.Array:
         """Return the margin of the domain at a state, shape (n,): positive if the parameters allow the state."""

@@ -72,7 +72,7 @@ class DrivenSystem(LiftedSystem):
         if body.space is not None and body.space.dtype.kind == "c":
             raise InputError(f"an energy that depends on time needs a real space, but {body.space.name} is complex")
         self.poisson = ProductPoisson(body.poisson, _ClockPoisson(unit))
-        energy = Sum((*map(self._extend_term, body.energy.terms), _NegativeWork(unit)))
+        energy = Sum((*map(self._lift_energy_term, body.energy.terms), _NegativeWork(unit)))
         self.energy = energy if self.space is not None else with_polynomial_degrees(energy, self.dim)
         self._lift_laws()
         if body.torque_laws.name:
@@ -167,19 +167,21 @@ class DrivenSystem(LiftedSystem):
         return jnp.concatenate([self.body.raise_index(x[:-2], alpha[:-2]), jnp.zeros(2)])
 
     def _body_at_time(self, t) -> System:
+        """Return the body with its energy and torque frozen at the time t."""
         return self.body.at_time(t, self.attitude)
 
     # -- functions ----------------------------------------------------------------------------------------------------
 
     def pullback(self, energy: Energy) -> Energy:
-        return self.extend(self.body.energy_of_flat_states(energy))
+        return self.lift_energy(self.body.energy_of_flat_states(energy))
 
-    def _extend_term(self, term: Energy) -> Energy:
+    def _lift_energy_term(self, term: Energy) -> Energy:
+        """Return a term of the energy of the body as a function of states with time and work."""
         clock = _StateTimeMap(self.body.dim, self.unit)
-        return _EnergyOfStateAndTime(term.with_time(), clock) if term.depends_on_time else self.extend(term)
+        return _EnergyOfStateAndTime(term.with_time(), clock) if term.depends_on_time else self.lift_energy(term)
 
     @property
-    def ledger(self):
+    def ledger_functions(self):
         return {WORK_NAME: Quadratic(jnp.zeros(self.dim), jnp.zeros(self.dim).at[-1].set(1.0 / self.unit))}
 
     def to_user_solution(self, solution):

@@ -77,16 +77,20 @@ class EmbeddedSystem(System):
         )
 
     def _mark_polynomial_degrees(self, energy: Energy) -> Energy:
+        """Return an energy with the degree set in each function that is a polynomial of the components of a state."""
         return with_polynomial_degrees(energy, self.dim)
 
     kind = forward_to("manifold_system")
 
     @property
     def domain(self) -> Domain:
-        name, why_singular = _space_of(self.manifold_system).name, self.manifold_system.domain.why_singular
-        return Domain(f"a point of {name}", self._why_outside, why_singular)
+        name, why_entropy_gradient_infinite = (
+            _space_of(self.manifold_system).name,
+            self.manifold_system.domain.why_entropy_gradient_infinite,
+        )
+        return Domain(f"a point of {name}", self._why_outside_domain, why_entropy_gradient_infinite)
 
-    ledger = forward_to("manifold_system")
+    ledger_functions = forward_to("manifold_system")
 
     @property
     def wrapped_system(self) -> WrappedSystem:
@@ -96,7 +100,7 @@ class EmbeddedSystem(System):
     def constraint_surface(self) -> ConstraintSurface:
         return ConstraintSurface(_space_of(self.manifold_system), self.is_tangent)
 
-    def _why_outside(self, x) -> str:
+    def _why_outside_domain(self, x) -> str:
         space, x = _space_of(self.manifold_system), np.atleast_2d(x)
         if not np.isfinite(x).all():
             return ""
@@ -167,13 +171,14 @@ class _TangentDissipation(LiftedDissipation):
     def force(self, system, x, dH, dS, dL):
         return _tangent_force(self, x, dH, dS, dL)
 
-    def divergence(self, system, x):
+    def factor_divergence(self, system, x):
         """Return the divergence of the noise with respect to the volume of the manifold."""
-        return self.inner.divergence(self.manifold_system, system.constraint_surface.project_state(x))
+        return self.inner.factor_divergence(self.manifold_system, system.constraint_surface.project_state(x))
 
 
 @jit_if_traced
 def _tangent_force(dissipation: _TangentDissipation, x, dH, dS, dL) -> jax.Array:
+    """Return the force of the inner dissipation, projected to the tangent space of the level sets, shape (n,)."""
     geometry = dissipation.lifted_geometry(dissipation.manifold_system, x)
     velocity = dissipation.inner.force(geometry.system, geometry.x, *geometry.inner_gradients(dH, dS, dL))
     return velocity if dissipation.is_projection_trivial else geometry.lower_velocity(velocity)
@@ -244,10 +249,12 @@ def _tangential_part(system: System, x, w):
 
 @jit_if_traced
 def _tangential_part_in_space(space: mf.Space, x, w):
+    """Return an array w without the component that would change the constraints of a space."""
     return space.to_vector(space._tangential_part(space.from_vector(x), space.from_vector(w)))
 
 
 def _space_of(system: System) -> mf.Space:
+    """Return the space of a system on a manifold."""
     assert system.space is not None
     return system.space
 
@@ -351,6 +358,8 @@ class _ChartDissipation(LiftedDissipation):
         point = _ChartPoint(self.system, self.coordinates, self.place, x)
         return LiftedGeometry(self.system, point.state, point.lift_covector, point.lower_velocity)
 
-    def divergence(self, system, x):
+    def factor_divergence(self, system, x):
         """Return the divergence of the noise with respect to the volume of the manifold."""
-        return self.inner.divergence(self.system, _ChartPoint(self.system, self.coordinates, self.place, x).state)
+        return self.inner.factor_divergence(
+            self.system, _ChartPoint(self.system, self.coordinates, self.place, x).state
+        )

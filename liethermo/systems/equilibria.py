@@ -23,11 +23,11 @@ from .linearisation import (
     Stability,
     abbreviate_names,
     conserved_functions,
+    constant_temperature_entropy_indices,
     evaluate_functions,
     field_derivatives,
     field_derivatives_and_invariants,
     freeze_system,
-    heat_counter_indices,
     linearise_at,
 )
 
@@ -204,7 +204,9 @@ def equilibria(
     names = _fixed_function_names(system, conserved_by_name, levels, points) if anchor is not None else ()
     fixed_functions = {name: conserved_by_name[name] for name in names}
     target_values = None if anchor is None else evaluate_functions(tuple(fixed_functions.values()), anchor[None])[0]
-    search = _EquilibriumSearch(system, tuple(fixed_functions.values()), target_values, heat_counter_indices(system))
+    search = _EquilibriumSearch(
+        system, tuple(fixed_functions.values()), target_values, constant_temperature_entropy_indices(system)
+    )
     scale = float(np.linalg.norm(points[0] if anchor is None else anchor)) or 1.0
     states = search.solve(points, scale)
     members = [_make_equilibrium(system, x, scale) for x in _distinct_states(states, SAME_STATE_RTOL * scale)]
@@ -264,14 +266,14 @@ def steady_state(system: System, x0=None, t: float | None = None) -> Equilibrium
     conserved_by_name = conserved_functions(system, x)
     functions = tuple(conserved_by_name.values())
     search = _EquilibriumSearch(
-        system, functions, evaluate_functions(functions, x[None])[0], heat_counter_indices(system)
+        system, functions, evaluate_functions(functions, x[None])[0], constant_temperature_entropy_indices(system)
     )
     scale = float(np.linalg.norm(x)) or 1.0
     states = search.solve(search.follow_transient_to_rest(x, scale)[None], scale)
     if not len(states):
         raise ConvergenceError(
             f"the motion of this {system.kind} from x0 does not come to rest: it may oscillate, grow, or have no "
-            "steady state. Give another x0, or look for unstable ones with lt.equilibria(system)",
+            "steady state. Give another x0, or look for unstable equilibria with lt.equilibria(system)",
             None,
         )
     return _make_equilibrium(system, states[0], scale)
@@ -282,7 +284,7 @@ def _make_equilibrium(system: System, x: np.ndarray, scale: float) -> Equilibriu
     derivatives, functions = field_derivatives_and_invariants(system, x)
     linearisation = linearise_at(system, x, derivatives, functions, scale)
     velocity = derivatives.velocity.copy()
-    velocity[heat_counter_indices(system)] = 0.0
+    velocity[constant_temperature_entropy_indices(system)] = 0.0
     norm = float(np.linalg.norm(derivatives.jacobian))
     levels = dict(zip(functions, derivatives.values.tolist(), strict=True))
     levels["energy"] = float(evaluate_functions((system.energy,), x[None])[0, 0])

@@ -25,7 +25,7 @@ from ..functions.energy import Energy, Function, Quadratic, TimeDependent, make_
 from ..functions.newton import inverse_gradient
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.traced import trace_callables
-from .body_states import checked_velocity, is_given_by_velocity
+from .body_states import checked_velocity, is_state_given_by_velocity
 from .interface import BodyKinematics, EngineHints
 from .ledger import LedgerSystem
 from .lie_poisson import LiePoissonSystem, body_velocity_slices
@@ -306,7 +306,7 @@ class EulerPoincareClosedSystem(LedgerSystem):
             If neither or both of x and the angular velocity are given, or no state has these values.
         """
         details = {"rotor_rates": rotor_rates, "temperature": temperature, "degrees": degrees or None}
-        if not is_given_by_velocity(self, x, angular_velocity, "velocity xi", **details):
+        if not is_state_given_by_velocity(self, x, angular_velocity, "velocity xi", **details):
             return super().state(x, batch)
         xi = checked_velocity(angular_velocity, rotor_rates, self.algebra.dim, batch, degrees)
         if temperature is None:

@@ -154,7 +154,7 @@ class EvolutionSystem(MomentumContactSystem):
     configurations : manifolds.Space or None
     """
 
-    __init__ = MomentumContactSystem.__init__  # said here for type checkers, which would make one of the fields
+    __init__ = MomentumContactSystem.__init__  # explicit, because type checkers would generate one from the fields
 
     entropy_production_name: ClassVar[str] = "Delta_Q H"
 
@@ -203,7 +203,9 @@ def tangent_bundle_of(space: mf.Space | None) -> mf.TangentBundle | None:
         return None
     bundle = mf.TangentBundle(space)
     if not bundle.can_be_embedded:
-        raise InputError(f"{space.name} has no equations in the arrays around it, so no momenta are taken along it")
+        raise InputError(
+            f"{space.name} is not a level set of equations for arrays, so it has no bundle of momenta here"
+        )
     return bundle
 
 

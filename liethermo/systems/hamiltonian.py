@@ -19,7 +19,13 @@ from manifolds._pytree_module import Module
 from manifolds.matrices.linear import adjoint
 
 from ..dissipation.lindblad import LindbladJumps, OperatorFunction
-from ..dissipation.operators import HasMatrix, Operator, checked_hermitian, checked_square_matrix, level_gap_rounding
+from ..dissipation.operators import (
+    HasMatrix,
+    Operator,
+    checked_hermitian,
+    checked_square_matrix,
+    level_gap_rounding_bound,
+)
 from ..dissipation.quantum import cluster_labels
 from ..errors import InputError
 from ..functions.bath_energy import BathEnergy, ReservoirEnergy
@@ -51,14 +57,14 @@ def make_hamiltonian_energy(hamiltonian, times=None) -> tuple[int, Energy]:
             for t in TEST_TIMES
         ]
         structure = mf.DensityMatrices(len(matrices[0]))
-        with jax.ensure_compile_time_eval():  # a number, while a family of systems is traced
+        with jax.ensure_compile_time_eval():  # it stays a number while JAX traces a family of systems
             lowest = jnp.asarray(np.diag(matrices[0]).real.min())
         return structure.size, TimeDependent(ExpectationValue(hamiltonian, structure, lowest))
     if isinstance(hamiltonian, jax.core.Tracer):
         structure = mf.DensityMatrices(hamiltonian.shape[-1])
         return structure.size, MeanEnergy(structure.vector(hamiltonian), jnp.min(jnp.diag(hamiltonian).real))
     H = checked_hermitian(checked_square_matrix(hamiltonian, "the Hamiltonian"), "the Hamiltonian")
-    with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
+    with jax.ensure_compile_time_eval():  # they stay numbers while JAX traces a family of systems
         b = jnp.asarray(mf.DensityMatrices(len(H)).vector(H))
         reference = jnp.asarray(lower_level_of_smallest_gap(np.diag(H).real))
     return len(H), MeanEnergy(b, reference)
@@ -75,7 +81,7 @@ def _value_at_time(function, t: float, what: str):
     try:
         inspect.signature(function).bind(t)
     except TypeError as error:
-        raise InputError(f"{what}, where it is a function, is one of the time t alone: {error}") from None
+        raise InputError(f"{what}, if it is a function, must be one of the time t alone: {error}") from None
     except ValueError:  # the signature is not known
         pass
     return function(t)
@@ -118,7 +124,7 @@ def _energy_of_hamiltonian_terms(terms: Sequence, times) -> tuple[int, Energy]:
     if times is not None and not any(isinstance(f, ContinuedSpline) for f in functions):
         raise InputError("times= belongs to coefficients that are arrays, and the Hamiltonian has none. Remove times=")
     structure = mf.DensityMatrices(len(H))
-    with jax.ensure_compile_time_eval():  # numbers, while a family of systems is traced
+    with jax.ensure_compile_time_eval():  # they stay numbers while JAX traces a family of systems
         matrices = (sum(constant_matrices, np.zeros_like(H)), *modulated_matrices)
         static, *rows = (jnp.asarray(structure.vector(a)) for a in matrices)
         reference = jnp.asarray(lower_level_of_smallest_gap(np.asarray(static)[: structure.size]))
@@ -231,7 +237,9 @@ def join_baths(first_baths: HeatBaths, second_baths: HeatBaths) -> HeatBaths:
         return first_baths if first_baths.number else second_baths
     kinds = BathEnergy | ReservoirEnergy
     if not isinstance(first_baths.energy, kinds) or not isinstance(second_baths.energy, kinds):
-        raise InputError("baths of a product have constant capacities: build the product with baths of its own")
+        raise InputError(
+            "the baths of a product must have constant capacities. Build the product with baths of its own"
+        )
     capacity, temperature = (
         jnp.concatenate([getattr(first_baths.energy, name), getattr(second_baths.energy, name)])
         for name in ("capacity", "temperature")
@@ -327,9 +335,9 @@ class RotatingFrame(metaclass=ListedType):
         if D.any() and not resonant.any():
             frequency_text = ", ".join(f"{omega:.6g}" for omega in self.components(D) if omega >= 0.0)
             raise InputError(
-                f"no part of the drive is at rest in the frame: its frequencies there are {frequency_text}, and that "
-                f"of the drive is {frequency:.6g}. Give the frame a generator whose level distances contain that "
-                "frequency"
+                "no component of the drive is constant in the frame: the frame turns its components at the frequencies "
+                f"{frequency_text}, and the drive has the frequency {frequency:.6g}. Give the frame a generator with "
+                "two levels whose difference is that frequency"
             )
         components_of_constant = self.components(H)
         static = sum(
@@ -347,13 +355,13 @@ class RotatingFrame(metaclass=ListedType):
         """
         V = checked_square_matrix(operator, "the operator")
         self._check_size(V.shape, "the operator")
-        inside = adjoint(self.vectors) @ V @ self.vectors
+        V_in_eigenbasis = adjoint(self.vectors) @ V @ self.vectors
         gaps = self.levels[None, :] - self.levels[:, None]
         labels = cluster_labels(gaps.ravel(), self._tolerance).reshape(gaps.shape)
         rounding = 1e-13 * np.abs(V).max()
         parts = {}
         for label in range(labels.max() + 1):
-            part = np.where(labels == label, inside, 0.0)
+            part = np.where(labels == label, V_in_eigenbasis, 0.0)
             if np.abs(part).max() > rounding:
                 parts[float(gaps[labels == label].mean())] = self.vectors @ part @ adjoint(self.vectors)
         return parts
@@ -415,12 +423,16 @@ class RotatingFrame(metaclass=ListedType):
 
     @property
     def _tolerance(self) -> float:
-        return len(self.levels) * level_gap_rounding(self.generator)
+        """Difference of frequencies in the frame up to which they count as equal."""
+        return len(self.levels) * level_gap_rounding_bound(self.generator)
 
     def _check_size(self, shape: tuple[int, ...], what: str) -> None:
+        """Raise InputError unless a matrix has the shape of the generator."""
         if shape != self.generator.shape:
             generator_shape = self.generator.shape
-            raise InputError(f"{what} has shape {shape}, but the generator of the frame has shape {generator_shape}")
+            raise InputError(
+                f"{what} must have the shape of the generator of the frame, {generator_shape}, got {shape}"
+            )
 
 
 class _FrameHamiltonian(Module):

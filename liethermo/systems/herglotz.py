@@ -68,7 +68,7 @@ class VelocityContactSystem(ContactManifoldSystem):
         """Return the Hamiltonian as a function of (q, p, S); InputError if q is not in R^n."""
         if self.configurations is not None:
             raise InputError(
-                f"the Legendre transform is inverted on R^n alone, and positions are in {self.configurations.name}. "
+                f"the Legendre transform is inverted on R^n only, but positions are in {self.configurations.name}. "
                 "Give lt.EvolutionSystem or lt.ContactSystem the Hamiltonian, with space="
             )
         return _legendre_hamiltonian(self.lagrangian, self.dim)
@@ -124,7 +124,7 @@ class ThermodynamicHerglotz(LagrangianSystem):
     lagrangian : Energy
     """
 
-    __init__ = LagrangianSystem.__init__  # said here for type checkers, which would make one of the fields
+    __init__ = LagrangianSystem.__init__  # explicit, because type checkers would generate one from the fields
 
     entropy_production_name: ClassVar[str] = "Delta(L)"
 

@@ -16,7 +16,7 @@ import scipy
 
 from ..dissipation.base import ABSENT_DISSIPATION, Dissipation, LawName
 from ..dissipation.geometry import Geometry
-from ..errors import InputError
+from ..errors import InputError, refuse_replaced_members
 from ..functions.energy import Energy
 from ..functions.surface import Surface
 from .attitude_layout import AttitudeLayout
@@ -193,13 +193,23 @@ REPLACED_MEMBERS = {
     "specific_residuals": "specific_axiom_residuals",
     "production_name": "entropy_production_name",
     "freeze_at": "cache_tensors_at",
+    "here": "cache_tensors_at",
     "surface": "constraint_surface",
     "solve_at_spins": "solve_slopes_at_each_spin",
-    "transport": "driving_covector",
+    "transport": "attitude_velocity_from_gradients",
     "energy_of_vectors": "energy_of_flat_states",
     "inner": "inner_system",
+    "ledger": "ledger_functions",
+    "own_residuals": "specific_axiom_residuals",
+    "pushed_by": "torque_laws",
+    "casimirs_of_torque": "torque_laws",
+    "left_alone": "drop_torque",
+    "without_baths": "drop_baths",
+    "presented": "to_user_solution",
+    "solved_for": "subsystem_to_solve",
+    "solved_subsystem": "subsystem_to_solve",
 }
-"""Names of members that kinds of systems used to override, and of those that replace them."""
+"""Former names of members that kinds of systems override, and the present names."""
 
 
 class SystemInterface(Geometry):
@@ -210,9 +220,7 @@ class SystemInterface(Geometry):
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
-        for name, replacement in REPLACED_MEMBERS.items():
-            if name in cls.__dict__:
-                raise TypeError(f"{cls.__name__} defines {name}, which nothing calls. Override {replacement}")
+        refuse_replaced_members(cls, REPLACED_MEMBERS)
 
     entropy: Energy | None
     dissipation: Dissipation | None
@@ -413,7 +421,7 @@ class SystemInterface(Geometry):
         return None
 
     @property
-    def ledger(self) -> dict[str, Energy]:
+    def ledger_functions(self) -> dict[str, Energy]:
         """Functions of a state, by name, that give the work and the heat received from outside along a run."""
         return {}
 

@@ -52,21 +52,21 @@ def candidate_invariants(system: SystemInterface) -> dict[str, Energy]:
 
 def preserved_function_names(system: SystemInterface) -> tuple[str, ...]:
     """Return the names of the preserved functions of a system, those of :func:`candidate_invariants`."""
-    return tuple(number_preserved_functions(system)) if system.preserved_labels is None else system.preserved_labels
+    return tuple(preserved_functions_by_number(system)) if system.preserved_labels is None else system.preserved_labels
 
 
-def number_preserved_functions(system: SystemInterface) -> dict[str, Energy]:
-    """Return the preserved functions of a system by the names "preserved 1", "preserved 2" and so on."""
+def preserved_functions_by_number(system: SystemInterface) -> dict[str, Energy]:
+    """Return the preserved functions of a system in a dict with the names "preserved 1", "preserved 2" and so on."""
     return {f"preserved {i + 1}": L for i, L in enumerate(system.preserved_functions)}
 
 
 def find_preserved_function_names(system: SystemInterface) -> tuple[str, ...]:
-    """Return a name for each preserved function: of a map or Casimir that it is a multiple of, or its own."""
+    """Return a name for each preserved function: that of a map or Casimir of which it is a multiple, or its own."""
     functions = named_then_preserved_functions(system)
     states = random_test_states(system, 2)
     gradients = evaluate_at_points(stack_gradients, functions, states)  # shape (points, functions, n)
-    multiple_indices = first_proportional_indices(gradients, len(system.preserved_functions))
-    return name_preserved_functions(system, multiple_indices.tolist())
+    proportional_indices = first_proportional_indices(gradients, len(system.preserved_functions))
+    return name_preserved_functions(system, proportional_indices.tolist())
 
 
 def named_then_preserved_functions(system: SystemInterface) -> tuple[Energy, ...]:
@@ -74,21 +74,23 @@ def named_then_preserved_functions(system: SystemInterface) -> tuple[Energy, ...
     return (*(system.momentum_maps | system.casimirs()).values(), *system.preserved_functions)
 
 
-def name_preserved_functions(system: SystemInterface, multiple_indices: Sequence[int]) -> tuple[str, ...]:
-    """Return a name for each preserved function: that of an earlier function it is a multiple of, or its own.
+def name_preserved_functions(system: SystemInterface, proportional_indices: Sequence[int]) -> tuple[str, ...]:
+    """Return a name for each preserved function: that of an earlier function of which it is a multiple, or its own.
 
     Parameters
     ----------
-    multiple_indices : sequence of int
+    proportional_indices : sequence of int
         For each preserved function, the index in :func:`named_then_preserved_functions` of an earlier function of
         which it is a multiple; -1 if there is none.
     """
     names, reserved_names = list(system.momentum_maps | system.casimirs()), {"energy", "entropy"}
     n_named = len(names)
-    for multiple, (fallback, L) in zip(multiple_indices, number_preserved_functions(system).items(), strict=True):
+    for proportional_index, (fallback, L) in zip(
+        proportional_indices, preserved_functions_by_number(system).items(), strict=True
+    ):
         name = function_name(L)
-        usable = name.isidentifier() and name not in {*names, *reserved_names}
-        names.append(names[multiple] if multiple >= 0 else name if usable else fallback)
+        is_usable = name.isidentifier() and name not in {*names, *reserved_names}
+        names.append(names[proportional_index] if proportional_index >= 0 else name if is_usable else fallback)
     return tuple(names[n_named:])
 
 
@@ -185,7 +187,7 @@ def invariants_by_construction(system: SystemInterface) -> frozenset[str]:
 
 
 def recorded_functions_with_verdicts(system: SystemInterface) -> dict[str, tuple[Energy, bool | None]]:
-    """Return the functions to record along a run, by name, each with whether it is conserved; None if undecided."""
+    """Return the functions to record along a run, by name, each with True if conserved, False if not, else None."""
     if system.inner_system is not None:
         inner_verdicts = recorded_functions_with_verdicts(system.inner_system)
         return {name: (f.on(range(system.inner_system.dim)), verdict) for name, (f, verdict) in inner_verdicts.items()}
@@ -234,7 +236,7 @@ def are_conserved(
     rates = evaluate_at_points(function_rates_of_change, (system, functions), points)
     is_defined, is_conserved = judge_conservation(rates)  # shapes (points, functions)
     flags_by_function = zip(is_defined.T, is_conserved.T, strict=True)
-    return [bool(conserved[defined].all()) if defined.any() else None for defined, conserved in flags_by_function]
+    return [bool(holds[is_valid].all()) if is_valid.any() else None for is_valid, holds in flags_by_function]
 
 
 class _RestrictedEnergy(Energy):

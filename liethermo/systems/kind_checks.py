@@ -1,4 +1,4 @@
-"""Ask what kind a system has, and unwrap the system of the user."""
+"""Checks of the kind of a system, and the user's system without the wrappers that a run adds."""
 
 from __future__ import annotations
 

@@ -60,8 +60,8 @@ class LedgerSystem(System):
         def check(function, result_shape, what):
             if function is None:
                 return None
-            checked = checked_state_function(function, argument_shapes, result_shape, what, arguments_text)
-            return checked if len(shape) == 1 else FlattenedFunction(checked, shape)
+            checked_function = checked_state_function(function, argument_shapes, result_shape, what, arguments_text)
+            return checked_function if len(shape) == 1 else FlattenedFunction(checked_function, shape)
 
         if friction is None or callable(friction):
             self.friction = check(friction, shape, "friction")
@@ -130,7 +130,7 @@ class LedgerSystem(System):
         return jnp.stack([power, heat_power, jnp.ones(())])[: self.dim - self.dim_without_ledger]
 
     @property
-    def ledger(self) -> dict[str, Energy]:
+    def ledger_functions(self) -> dict[str, Energy]:
         names = ("work received", "heat received") if self.has_ledger else ()
         rows = jnp.eye(self.dim)
         return {name: Quadratic(jnp.zeros(self.dim), rows[self.dim_without_ledger + i]) for i, name in enumerate(names)}
@@ -198,11 +198,12 @@ class LedgerSystem(System):
 
     @property
     def domain(self) -> Domain:
-        return Domain("a positive temperature", self._why_outside, margin=self.temperature)
+        return Domain("a positive temperature", self._why_outside_domain, margin=self.temperature)
 
-    def _why_outside(self, x) -> str:
+    def _why_outside_domain(self, x) -> str:
+        """Return that the temperature at a state is not positive, as a text; "" if it is positive."""
         T = float(evaluate_at_points(_temperature, self, np.atleast_2d(x)).min())
-        return "" if T > 0.0 else f"the temperature -dL/dS is {T:.4g}: it has to be positive"
+        return "" if T > 0.0 else f"the temperature -dL/dS must be positive, got {T:.4g}"
 
     def specific_axiom_residuals(self, x) -> dict[str, jax.Array]:
         arguments = self.split_state(x)

@@ -20,7 +20,7 @@ from ..functions.energy import Energy, make_energy
 from ..tracing.caching import memoize
 from ..tracing.interpret import evaluate_at_points
 from .baths import BathEntropy, HeatBaths
-from .body_states import append_bath_entropies, checked_velocity, is_given_by_velocity, momentum_of_velocity
+from .body_states import append_bath_entropies, checked_velocity, is_state_given_by_velocity, momentum_of_velocity
 from .interface import TORQUE_FREE_LAWS, BodyKinematics, OrbitLevels, TorqueLaws
 from .torque import (
     MAX_ARGUMENTS,
@@ -62,8 +62,8 @@ class LiePoissonSystem(TorqueSystem):
     group : manifolds.MatrixGroup, optional
         A group of this algebra. If the algebra is a sum with an abelian one, as for a body with internal wheels, the
         group may be that of the first summand. :func:`liethermo.integrate` then returns attitudes g(t) too, with
-        ``g' = g hat(xi)``. Here xi is :meth:`driving_covector`: the gradient of H, and the velocity that internal
-        friction adds. The momentum in space is ``Ad_star(inverse(g), mu)``, and it is constant if no torque acts.
+        ``g' = g hat(xi)``. Here xi is the gradient of H plus the velocity that internal friction adds. The momentum in
+        space is ``Ad_star(inverse(g), mu)``, and it is constant if no torque acts.
     reconstruction : {"coadjoint", "cayley", "exp"}, optional
         The map of the attitude. The default conserves the spatial momentum of a free body, if the group has such a
         map; otherwise it is Cayley's map, or ``"exp"``, which stays in every group.
@@ -157,7 +157,7 @@ class LiePoissonSystem(TorqueSystem):
         )
         if "rotor_rates" not in parts:
             return quantities
-        rotors = parts["rotor_rates"]  # their momenta cancel that of the body in a momentum of the whole near zero
+        rotors = parts["rotor_rates"]  # if the total momentum is near zero, those of body and rotors cancel
         return quantities._replace(momentum_scale=lambda x: jnp.max(jnp.abs(x[rotors])))
 
     def state(
@@ -195,7 +195,7 @@ class LiePoissonSystem(TorqueSystem):
         [0.30000000000000004, 0.4, 0.3, 0.0]
         """
         details = {"rotor_rates": rotor_rates, "temperature": temperature, "degrees": degrees or None}
-        if not is_given_by_velocity(self, x, angular_velocity, "momentum", **details):
+        if not is_state_given_by_velocity(self, x, angular_velocity, "momentum", **details):
             return super().state(x, batch)
         velocity = checked_velocity(angular_velocity, rotor_rates, self.algebra.dim, batch, degrees)
         momentum = self.momentum_of_velocity(velocity, t)

@@ -34,12 +34,12 @@ class LiftedSystem(System):
     def _lift_laws(self) -> None:
         """Set entropy, momentum maps and dissipation to those of the inner system, as functions of longer states."""
         inner = self.inner_system
-        self.entropy = None if inner.entropy is None else self.extend(inner.entropy)
-        self.momentum_maps = {name: self.extend(J) for name, J in inner.momentum_maps.items()}
-        self.dissipation = InnerDissipation.lift_terms(inner.dissipation, self.extend)
+        self.entropy = None if inner.entropy is None else self.lift_energy(inner.entropy)
+        self.momentum_maps = {name: self.lift_energy(J) for name, J in inner.momentum_maps.items()}
+        self.dissipation = InnerDissipation.lift_terms(inner.dissipation, self.lift_energy)
         self.preserved_labels, self.invariant_verdicts = inner.preserved_labels, inner.invariant_verdicts
 
-    def extend(self, energy: Energy) -> Energy:
+    def lift_energy(self, energy: Energy) -> Energy:
         """Return an energy as a function of states, from an energy of inner states."""
         return energy.on(range(self.inner_system.dim))
 
@@ -48,8 +48,8 @@ class LiftedSystem(System):
         n = self.inner_system.dim
         return x[:n], dH[:n], None if dS is None else dS[:n], tuple(L[:n] for L in dL)
 
-    def driving_covector(self, x, dH, dS, dL=()):
-        return self.inner_system_at(x).driving_covector(*self.restrict_to_inner_state(x, dH, dS, dL))
+    def attitude_velocity_from_gradients(self, x, dH, dS, dL=()):
+        return self.inner_system_at(x).attitude_velocity_from_gradients(*self.restrict_to_inner_state(x, dH, dS, dL))
 
     def raise_index(self, x, alpha):
         n = self.inner_system.dim
@@ -60,7 +60,7 @@ class LiftedSystem(System):
         return jnp.concatenate([self.inner_system.lower_index(x[:n], v[:n]), v[n:]])
 
     def casimirs(self) -> dict[str, Energy]:
-        return {name: self.extend(C) for name, C in self.inner_system.casimirs().items()}
+        return {name: self.lift_energy(C) for name, C in self.inner_system.casimirs().items()}
 
     @property
     def domain(self) -> Domain:
@@ -68,7 +68,7 @@ class LiftedSystem(System):
         return Domain(
             domain.description,
             lambda x: self._inner_system_at_first_state(x).domain.why_outside(x[..., :n]),
-            lambda x: self._inner_system_at_first_state(x).domain.why_singular(x[..., :n]),
+            lambda x: self._inner_system_at_first_state(x).domain.why_entropy_gradient_infinite(x[..., :n]),
             None if domain.margin is None else lambda x: self.inner_system_at(x).domain.margin_at(x[..., :n]),
         )
 

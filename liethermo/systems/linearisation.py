@@ -111,7 +111,7 @@ def _poisson_tensor(system: System, x) -> jax.Array:
     return jax.jacfwd(lambda alpha: system.poisson.sharp(x, alpha))(jnp.zeros(system.dim))
 
 
-def heat_counter_indices(system: System) -> np.ndarray:
+def constant_temperature_entropy_indices(system: System) -> np.ndarray:
     """Return the indices, shape (k,), of the entropies of baths of constant temperature, which only count heat.
 
     The motion of the other components does not depend on them, so they may grow in a steady state.
@@ -151,9 +151,11 @@ def freeze_system(system: System, t: float | None) -> System:
 
 
 def _describe_time_dependent_part(system: System) -> str:
-    """Return a clause that says which part of a driven system depends on time; "" if none does at the test times."""
+    """Return a clause for a message that names the part of a driven system that depends on time; "" if none does."""
     points = system.samples(3)
-    velocities = np.stack([evaluate_at_points(_velocity, s, points) for s in systems_at_test_times(system)])
+    velocities = np.stack(
+        [evaluate_at_points(_vector_field_at_state, s, points) for s in systems_at_test_times(system)]
+    )
     scale = np.abs(velocities).max()
     if np.abs(velocities - velocities[0]).max() <= EPS * 64 * scale:
         return ""
@@ -163,7 +165,7 @@ def _describe_time_dependent_part(system: System) -> str:
     return f"{what} of this {system.kind} depends on time"
 
 
-def _velocity(system: System, x) -> jax.Array:
+def _vector_field_at_state(system: System, x) -> jax.Array:
     """Return the vector field at one state, shape (n,)."""
     return system._vector_field(x)
 
@@ -182,7 +184,7 @@ def conserved_functions(system: System, x) -> dict[str, Energy]:
             conserved_by_name.update(components.get(name, {name: g}))
     if system.energy_law == "conserved" and not system.torque_laws.name:
         conserved_by_name["energy"] = system.energy
-    counter_indices = heat_counter_indices(system)
+    counter_indices = constant_temperature_entropy_indices(system)
     if not counter_indices.size or not conserved_by_name:
         return conserved_by_name
     gradients = evaluate_at_points(stack_gradients, tuple(conserved_by_name.values()), np.atleast_2d(np.asarray(x)))
@@ -392,7 +394,7 @@ def linearise(system: System, x, t: float | None = None) -> Linearisation:
     derivatives, functions = field_derivatives_and_invariants(system, x)
     size = float(np.linalg.norm(x))
     limit = REST_RTOL * np.linalg.norm(derivatives.jacobian) * (size or 1.0)
-    velocity = np.delete(derivatives.velocity, heat_counter_indices(system))
+    velocity = np.delete(derivatives.velocity, constant_temperature_entropy_indices(system))
     if not np.linalg.norm(velocity) <= limit:
         raise InputError(
             f"x is not an equilibrium: the vector field there has the norm {np.linalg.norm(velocity):.3g}. Find one "
@@ -412,7 +414,7 @@ def linearise_at(
     system: System, x: np.ndarray, derivatives: FieldDerivatives, functions: dict[str, Energy], scale: float
 ) -> Linearisation:
     """Return the linear motion near an equilibrium x of a frozen system, from derivatives computed there."""
-    counter_indices = heat_counter_indices(system)
+    counter_indices = constant_temperature_entropy_indices(system)
     frame = derivatives.frame
     n = frame.shape[1]
     body = np.delete(np.arange(len(frame)), counter_indices) if counter_indices.size else np.arange(len(frame))
@@ -459,9 +461,9 @@ def evaluate_functions(functions: Sequence[Energy], states: np.ndarray) -> np.nd
     """Return the values of functions at states, shape (m, n), as an array, shape (m, functions)."""
     if not functions:
         return np.zeros((len(states), 0))
-    return evaluate_at_points(_values, tuple(functions), states)
+    return evaluate_at_points(_values_at_state, tuple(functions), states)
 
 
-def _values(functions: tuple[Energy, ...], x) -> jax.Array:
+def _values_at_state(functions: tuple[Energy, ...], x) -> jax.Array:
     """Return the values of functions at one state, shape (functions,)."""
     return jnp.stack([g.value(x) for g in functions])

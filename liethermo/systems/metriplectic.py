@@ -98,8 +98,8 @@ class MetriplecticSystem(System):
             raise InputError("the Poisson structure does not say how many coordinates it has. Give it its dimension")
         if space is not None and poisson.dim != space.size:
             raise InputError(
-                f"the Poisson structure has {poisson.dim} coordinates, but a point of {space.name} has {space.size} "
-                "real components, and it acts on those"
+                f"the Poisson structure must have {space.size} coordinates, one for each real component of a point of "
+                f"{space.name}, got {poisson.dim}"
             )
         if dim is not None and dim != poisson.dim:
             raise InputError(f"dim is {dim}, but the Poisson structure has {poisson.dim} coordinates")

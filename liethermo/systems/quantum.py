@@ -18,7 +18,7 @@ from manifolds.matrices.linear import adjoint
 from ..dissipation.adiabatic import ADIABATIC_LIMIT, AdiabaticJumps, adiabatic_parameter
 from ..dissipation.base import Dissipation, dissipation_terms
 from ..dissipation.lindblad import LindbladJumps
-from ..dissipation.operators import HasMatrix, checked_hermitian, level_gap_rounding
+from ..dissipation.operators import HasMatrix, checked_hermitian, level_gap_rounding_bound
 from ..dissipation.quantum import ThermalJumps
 from ..dissipation.steepest_ascent import SteepestEntropyAscent
 from ..errors import InputError
@@ -203,7 +203,9 @@ class QuantumSystem(System):
         InputError
         """
         rho = self._array_of_qobj(rho)
-        if isinstance(rho, jax.core.Tracer) or (np.shape(rho)[-1:] == (self.dim,) and not self._is_matrix(rho, batch)):
+        if isinstance(rho, jax.core.Tracer) or (
+            np.shape(rho)[-1:] == (self.dim,) and not self._has_shape_of_density_matrix(rho, batch)
+        ):
             return super().state(rho, batch)
         matrices = checked_density_matrices(np.asarray(rho), self.structure.size, mixed)
         front, m = matrices.shape[:-2], self.dim - self.body_dim
@@ -217,7 +219,7 @@ class QuantumSystem(System):
         """Return the state x, checked; a matrix or a ket becomes the state with all bath entropies zero."""
         x = self._array_of_qobj(x)
         if not isinstance(x, jax.core.Tracer) and (
-            self._is_matrix(x, batch) or self._has_shape_of_ket_or_stacked_operator(x)
+            self._has_shape_of_density_matrix(x, batch) or self._has_shape_of_ket_or_stacked_operator(x)
         ):
             x = np.asarray(self.state(x))
         return super().state_array(x, batch)
@@ -234,7 +236,7 @@ class QuantumSystem(System):
         size = self.structure.size
         return size > 1 and np.shape(x) in ((size,), (size, 1), (1, size), (size**2, 1))
 
-    def _is_matrix(self, x, batch: bool) -> bool:
+    def _has_shape_of_density_matrix(self, x, batch: bool) -> bool:
         """Return whether x has the shape of a density matrix, or with ``batch`` of several."""
         size = self.structure.size
         return np.shape(x)[-2:] == (size, size) and (size > 1 or not batch)
@@ -305,9 +307,11 @@ class QuantumSystem(System):
 
     @property
     def domain(self) -> Domain:
-        return Domain(why_outside=self._why_outside, why_singular=self._why_singular)
+        return Domain(
+            why_outside=self._why_outside_domain, why_entropy_gradient_infinite=self._why_entropy_gradient_infinite
+        )
 
-    def _why_outside(self, x) -> str:
+    def _why_outside_domain(self, x) -> str:
         """Return why states are outside of the cone of density matrices, as a text; "" if all are inside."""
         if is_traced(self):
             return ""
@@ -340,13 +344,13 @@ class QuantumSystem(System):
         if self._has_dissipation(AdiabaticJumps):
             parameter = float(np.max(np.asarray(self.adiabatic_parameter(np.unique(t)))))
             is_slow = parameter <= ADIABATIC_LIMIT
-            note = "" if is_slow else "the drive is too fast for jumps between the levels of the moment"
+            note = "" if is_slow else "the drive is too fast for jumps between instantaneous levels"
             conditions.append(RunCondition(ADIABATIC_ROW, parameter, ADIABATIC_LIMIT, is_slow, note, True))
         return tuple(conditions)
 
     def _why_rank_grows(self, x: np.ndarray, rho: np.ndarray) -> str:
         """Return why zero eigenvalues would not stay zero under steepest ascent, as a text; "" if they stay zero."""
-        kernels = self._kernels(rho)
+        kernels = self._kernel_bases(rho)
         rank_deficient = [i for i, kernel in enumerate(kernels) if kernel.size]
         is_rotated = [self._is_kernel_rotated(rho[i], kernels[i]) for i in rank_deficient]
         mix = "Use system.state(rho, mixed=1e-6)"
@@ -359,12 +363,12 @@ class QuantumSystem(System):
         grows = [self._equilibrium_population(x[i], kernels[i]) > self._zero_eigenvalue_limit for i in rank_deficient]
         if not any(grows):
             return ""
-        first_growing = grows.index(True)
-        eigenvalue = np.linalg.eigvalsh(rho[rank_deficient[first_growing]])[0]
+        growing_index = grows.index(True)
+        eigenvalue = np.linalg.eigvalsh(rho[rank_deficient[growing_index]])[0]
         floor = ", or give the system entropy=lt.VonNeumann(floor=1e-12), which keeps this eigenvalue at zero"
         return (
             f"its density matrix has the eigenvalue {eigenvalue:.3g}, where the gradient of the entropy is infinite. "
-            f"{mix}{'' if is_rotated[first_growing] else floor}"
+            f"{mix}{'' if is_rotated[growing_index] else floor}"
         )
 
     def _is_kernel_rotated(self, rho: np.ndarray, kernel: np.ndarray) -> bool:
@@ -373,7 +377,7 @@ class QuantumSystem(System):
         p = np.linalg.eigvalsh(rho)
         smallest_positive = p[p > self._zero_eigenvalue_limit].min()
         return any(
-            np.abs(complement @ H @ kernel).max() > level_gap_rounding(H) / smallest_positive
+            np.abs(complement @ H @ kernel).max() > level_gap_rounding_bound(H) / smallest_positive
             for H in self.hamiltonians_at_test_times()
         )
 
@@ -388,12 +392,12 @@ class QuantumSystem(System):
         affinity = np.asarray(self.structure.matrix(ascent.ascent_direction(self, x, self.energy.gradient(x), dS, dL)))
         return float(np.exp(np.linalg.eigvalsh(adjoint(kernel) @ affinity @ kernel)[-1] - 1.0))
 
-    def _why_singular(self, x) -> str:
+    def _why_entropy_gradient_infinite(self, x) -> str:
         """Return why the gradient of the entropy is infinite at states, as a text; "" if it is finite."""
         if is_traced(self) or not self._has_dissipation(ThermalJumps):
             return ""
         x, rho = np.atleast_2d(x), self._density_matrices(x)
-        kernels = self._kernels(rho)
+        kernels = self._kernel_bases(rho)
         rank_deficient = [i for i, kernel in enumerate(kernels) if kernel.size]
         if not rank_deficient:
             return ""
@@ -440,7 +444,7 @@ class QuantumSystem(System):
         """Largest eigenvalue of a density matrix that counts as zero, by rounding or by the floor of the entropy."""
         return max(self.floor, ZERO_EIGENVALUE_PER_LEVEL * self.structure.size)
 
-    def _kernels(self, rho: np.ndarray) -> list[np.ndarray]:
+    def _kernel_bases(self, rho: np.ndarray) -> list[np.ndarray]:
         """Return the kernel of each density matrix, shape (m, N, N), as a list of bases, shape (N, r)."""
         return [vectors[:, p <= self._zero_eigenvalue_limit] for p, vectors in zip(*np.linalg.eigh(rho), strict=True)]
 
@@ -574,7 +578,8 @@ class QuantumSystem(System):
             offset += s.dim - s.body_dim
         if (self.baths.number == 0) != (other.baths.number == 0) and all(s.total_dissipation.terms for s in systems):
             raise InputError(
-                "the jumps of one part have a bath, but those of the other none. Give baths to both parts or to neither"
+                "the jumps of one part have a bath, but those of the other part have none. "
+                "Give baths to both parts or to neither"
             )
         H = [s._constant_hamiltonian() for s in systems]
         total_H = tensor_with_identity(H[0], 0, sizes) + tensor_with_identity(H[1], 1, sizes)
@@ -589,8 +594,8 @@ class QuantumSystem(System):
         interaction = checked_hermitian(interaction, "the interaction")
         if interaction.shape != (self.structure.size,) * 2:
             raise InputError(
-                f"the interaction has shape {interaction.shape}, and the Hamiltonian ({self.structure.size}, "
-                f"{self.structure.size})"
+                f"the interaction must have the shape of the Hamiltonian, ({self.structure.size}, "
+                f"{self.structure.size}), got {interaction.shape}"
             )
         terms = self.total_dissipation.terms
         H = self._constant_hamiltonian() + interaction
@@ -599,7 +604,7 @@ class QuantumSystem(System):
     def _constant_hamiltonian(self) -> np.ndarray:
         """Return the Hamiltonian, shape (N, N); InputError if it depends on time."""
         if self.is_driven:
-            raise InputError("products and couplings are of systems whose Hamiltonian does not depend on time")
+            raise InputError("products and interactions need a Hamiltonian that does not depend on time")
         return self.hamiltonians_at_test_times()[0]
 
 

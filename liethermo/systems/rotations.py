@@ -155,6 +155,7 @@ def rotation_matrices(rotations: Any) -> np.ndarray | jax.Array:
 
 
 def _warn_of_single_precision(distance: float, quantity: str) -> None:
+    """Warn that attitudes are rotations to single precision only, and that the nearest rotations are used."""
     warn(
         f"the attitude is a rotation to single precision only: {quantity} was off by {distance:.1e}. The nearest "
         "rotation is used",

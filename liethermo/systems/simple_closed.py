@@ -102,6 +102,7 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
         self._build_with_ledger(structure, dim, energy, forces, momentum_maps, validate, self._state_space(space))
 
     def _state_space(self, space: mf.Space | None) -> mf.Space | None:
+        """Return the space of states, with the ledger if there is one; None for positions in R^n."""
         return state_space(space, LEDGER_DIM if self.has_ledger else 0)
 
     # -- the state --------------------------------------------------------------------------------------------------

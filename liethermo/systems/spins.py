@@ -280,10 +280,10 @@ class _HeatingSpins(HeatingSites):
         super().__init__(shape)
         self._spins = spins
 
-    def _scale_each(self, values, v) -> jax.Array:
+    def _scale_each_site(self, values, v) -> jax.Array:
         return self._spins.join_state(scale_vectors(values, self._spins.split_covectors(v)), jnp.zeros(0))
 
-    def dot(self, alpha, v) -> jax.Array:
+    def dot_at_sites(self, alpha, v) -> jax.Array:
         return dot_vectors(self._spins.split_covectors(alpha), self._spins.split_covectors(v))
 
 
@@ -337,7 +337,7 @@ def _checked_powers(power, baths: HeatBaths) -> tuple[tuple[int, ...], tuple[Cal
     if power is None:
         return (), ()
     if not baths.number:
-        raise InputError("power= heats baths, and there are none. Give baths=lt.HeatBaths(...)")
+        raise InputError("power= heats baths, but this system has none. Give baths=lt.HeatBaths(...)")
     entries = list(power) if isinstance(power, list | tuple) else [power, *[None] * (baths.number - 1)]
     if len(entries) != baths.number:
         raise InputError(f"power must have {baths.number} entries, one per bath, got {len(entries)}")

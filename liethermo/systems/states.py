@@ -1,4 +1,4 @@
-"""Convert states: check what users give, evaluate functions at batches of states, and give states their shape."""
+"""Conversions of states: checks of those that users give, evaluation at batches of states, and shapes of lattices."""
 
 from __future__ import annotations
 
@@ -99,7 +99,9 @@ def checked_times(system: Any, t) -> jax.Array | None:
     if not system.is_driven:
         return None
     if t is None:
-        what = "energy of this system depends on" if system.energy.depends_on_time else "torque is known at a"
+        what = (
+            "energy of this system depends on" if system.energy.depends_on_time else "torque of this system depends on"
+        )
         raise InputError(f"the {what} time. Give the time beside the state")
     return jnp.asarray(t, dtype=jnp.float64)
 
@@ -123,5 +125,5 @@ def reshape_to_sites(system: Any, solution: Any) -> Any:
     if not system.sites:
         return solution
     states = {name: value for name in solution.state_fields if (value := getattr(solution, name)) is not None}
-    reshaped = {name: value.reshape(*value.shape[:-1], *system.shape) for name, value in states.items()}
-    return dataclasses.replace(solution, **reshaped)
+    reshaped_states = {name: value.reshape(*value.shape[:-1], *system.shape) for name, value in states.items()}
+    return dataclasses.replace(solution, **reshaped_states)

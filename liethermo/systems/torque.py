@@ -71,7 +71,7 @@ class TorqueSystem(System):
         if t is None or (attitude is None and laws.needs_attitude):
             what = "time and the attitude" if laws.needs_attitude else "time"
             raise InputError(
-                f"the torque {laws.name} is known at a {what}. Use system.at_time(t"
+                f"the torque {laws.name} has a value only at a {what}. Use system.at_time(t"
                 f"{', attitude' if laws.needs_attitude else ''})"
             )
         torque = self._torque_at(x, t, attitude)
@@ -107,7 +107,7 @@ def traced_torque_and_argument_counts(
         return None, ()
     terms = _torque_terms(user_torque)
     if not terms:
-        raise InputError("torque is an empty list: a system without a torque is given None")
+        raise InputError("torque is an empty list. For a system without a torque use None")
     argument_counts = tuple(map(_checked_argument_count, terms))
     if max(argument_counts) > MAX_ARGUMENTS_WITHOUT_ATTITUDE and group is None:
         name = torque_name(
@@ -226,7 +226,7 @@ def _checked_argument_count(term: Any) -> int:
             f"lt.torques.ConstantInBody([0.0, 0.0, 1.0]), got {type(term).__name__}"
         )
     if is_spline(term):
-        raise InputError("a spline needs a wrapper as a torque. Use lt.torques.Tabulated(spline)")
+        raise InputError("a spline is a torque only in a wrapper. Use lt.torques.Tabulated(spline)")
     count = len(term.program.argument_avals) if isinstance(term, TracedFunction) else required_argument_count(term)
     if count is None or not 1 <= count <= MAX_ARGUMENTS:
         raise InputError(

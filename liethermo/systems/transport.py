@@ -1,4 +1,4 @@
-"""Transport covectors: the velocities with which dissipations carry a momentum along its orbit."""
+"""The motion in two other forms: by the velocity of an attitude that follows it, or by a generator."""
 
 from __future__ import annotations
 
@@ -9,23 +9,24 @@ from ..dissipation.base import terms_with_preserved_values
 from .interface import SystemInterface
 
 
-def dissipation_velocities(system: SystemInterface, x, dH, dS, dL) -> list[jax.Array | None]:
-    """Return a list with the velocity of each dissipation, shape (n,); None for one that acts as a torque."""
+def added_attitude_velocities(system: SystemInterface, x, dH, dS, dL) -> list[jax.Array | None]:
+    """Return a list of the velocities, shape (n,), that the dissipations add to an attitude; None for a torque."""
     terms = terms_with_preserved_values(system.total_dissipation.terms, dL)
-    return [term.velocity(system, x, dH, dS, term_dL) for term, term_dL in terms]
+    return [term.added_attitude_velocity(system, x, dH, dS, term_dL) for term, term_dL in terms]
 
 
-def moves_by_transport_alone(system: SystemInterface) -> bool:
-    """Return whether Pi times :meth:`.System.driving_covector` is the whole motion, without external torques.
+def dissipation_keeps_spatial_momentum(system: SystemInterface) -> bool:
+    """Return whether no summand of the dissipation changes the spatial momentum of a body on a Lie algebra.
 
-    If so, the spatial momentum of a body on a Lie algebra is constant.
+    Then :meth:`.System.attitude_velocity_from_gradients` contains all of the dissipation, and without external torques
+    the spatial momentum is constant.
     """
     while system.inner_system is not None:
         system = system.inner_system
     answers: list[bool] = []
 
     def record_answer(x):
-        velocities = dissipation_velocities(system, x, x, x, (x,) * len(system.preserved_functions))
+        velocities = added_attitude_velocities(system, x, x, x, (x,) * len(system.preserved_functions))
         answers.append(all(sigma is not None for sigma in velocities))
 
     jax.eval_shape(record_answer, jax.ShapeDtypeStruct((system.dim,), jnp.float64))
@@ -33,7 +34,7 @@ def moves_by_transport_alone(system: SystemInterface) -> bool:
 
 
 def has_generator(system: SystemInterface) -> bool:
-    """Return whether a generator gives the motion without the entropy: see :func:`generator_field`."""
+    """Return whether :func:`generator_field` can compute the vector field without the entropy."""
     return system.total_dissipation.has_generator
 
 

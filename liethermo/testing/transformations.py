@@ -99,11 +99,11 @@ class _TransformedDissipation(LiftedDissipation):
     def generator_field(self, system, x, dH):
         return super().generator_field(system, x, dH / self.units[1])
 
-    def velocity(self, system, x, dH, dS, dL):
+    def added_attitude_velocity(self, system, x, dH, dS, dL):
         original, (_, energy, entropy) = self.lifted_geometry(system, x), self.units
         gradients = original.inner_gradients(dH / energy, None if dS is None else dS / entropy, dL)
-        velocity = self.inner.velocity(original.system, original.x, *gradients)
-        return None if velocity is None else energy * (self.inverse.T @ velocity)
+        sigma = self.inner.added_attitude_velocity(original.system, original.x, *gradients)
+        return None if sigma is None else energy * (self.inverse.T @ sigma)
 
     def factor(self, system, x, dH, dL):
         return None  # the amplitude of noise would scale differently
@@ -223,9 +223,9 @@ class _ScaledDissipation(LiftedDissipation):
         B = self.inner.factor(system, x, dH, dL)
         return None if B is None else B.scale_by(self.fraction)
 
-    def velocity(self, system, x, dH, dS, dL):
-        velocity = self.inner.velocity(system, x, dH, dS, dL)
-        return None if velocity is None else self.fraction * velocity
+    def added_attitude_velocity(self, system, x, dH, dS, dL):
+        sigma = self.inner.added_attitude_velocity(system, x, dH, dS, dL)
+        return None if sigma is None else self.fraction * sigma
 
 
 def split_dissipation_into_halves(system: System) -> Dissipation:

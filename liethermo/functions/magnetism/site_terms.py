@@ -385,7 +385,7 @@ class SitePolynomial(SpinEnergy):
         tables = self._power_tables(spins)
         total = jnp.zeros(())
         for powers, c in zip(self.powers, self.coefficients, strict=True):
-            total = total + c * _monomial(tables, powers, self.sites)
+            total = total + c * _evaluate_monomial(tables, powers, self.sites)
         return jnp.sum(jnp.broadcast_to(total, self.sites))
 
     def lattice_gradients(self, spins: PeriodicSpins) -> VectorComponents:
@@ -395,7 +395,9 @@ class SitePolynomial(SpinEnergy):
             for axis in range(3):
                 if powers[axis]:
                     lowered_powers = tuple(p - int(a == axis) for a, p in enumerate(powers))
-                    slopes[axis] = slopes[axis] + powers[axis] * c * _monomial(tables, lowered_powers, self.sites)
+                    slopes[axis] = slopes[axis] + powers[axis] * c * _evaluate_monomial(
+                        tables, lowered_powers, self.sites
+                    )
         if self.frame is None:
             return slopes[0], slopes[1], slopes[2]
         x_gradients, y_gradients, z_gradients = (
@@ -420,7 +422,7 @@ class SitePolynomial(SpinEnergy):
         return clique_pattern(np.arange(3 * math.prod(self.sites)).reshape(-1, 3), dim)
 
 
-def _monomial(tables: list[list[jax.Array]], powers, sites: tuple[int, ...]) -> jax.Array:
+def _evaluate_monomial(tables: list[list[jax.Array]], powers, sites: tuple[int, ...]) -> jax.Array:
     """Return the product of powers of the components on each site, from tables of the powers 1, 2, …."""
     factors = [table[p - 1] for table, p in zip(tables, powers, strict=True) if p]
     return math.prod(factors[1:], start=factors[0]) if factors else jnp.ones(sites)

@@ -55,7 +55,7 @@ class Subsystem(Module):
         elif isinstance(species, bool) or not isinstance(species, int) or species < 0 or dim != 1 + species:
             raise InputError(
                 f"{name or 'a subsystem'} holds {species!r} kinds of particles, so its state is (S, N) of dim 1 + "
-                f"species, got dim {dim!r}. Make a wall that moves a body of its own"
+                f"species, got dim {dim!r}. Model a moving wall as a body of its own"
             )
         self.dim, self.name = dim, name
         energy = Quadratic(jnp.zeros(dim)) if energy is None else make_energy(energy, "the energy of a subsystem")
@@ -133,7 +133,7 @@ class Copies(Module):
         return 0
 
     def energy_of_whole_state(self, start_index: int) -> Energy:
-        """Return the energy of all as a function of the whole state, in which they begin at ``start_index``."""
+        """Return the energy of all copies as a function of the whole state, in which they begin at ``start_index``."""
         indices = np.arange(start_index, start_index + self.count * self.dim).reshape(self.count, self.dim)
         return Each(self.energy, indices, *self.parameters)
 
@@ -301,9 +301,9 @@ class Reaction(Module):
             )
         stoichiometry, heat_shares = np.zeros(len(matter.N)), np.zeros(len(body_names))
         stoichiometry[indices], heat_shares[body] = self.stoichiometry, 1.0
-        no_transport = (0.0,) * len(body_names)
+        zero_transport = (0.0,) * len(body_names)
         L = _checked_state_function(self.rate, structure.dim, "the rate of a reaction")
-        return Process(tuple(stoichiometry.tolist()), tuple(heat_shares.tolist()), no_transport, jnp.zeros(()), L)
+        return Process(tuple(stoichiometry.tolist()), tuple(heat_shares.tolist()), zero_transport, jnp.zeros(()), L)
 
 
 def _checked_coefficient(coefficient, what: str) -> jax.Array | Callable:

@@ -103,7 +103,7 @@ def _read_csv(path: Path, weight: str) -> tuple[tuple[str, ...] | None, _EdgeLis
             missing_titles = [title for title in ("source", "target", weight) if title not in titles]
             if missing_titles:
                 raise InputError(
-                    f"{path} has no column {missing_titles[0]!r} in its first line, but {', '.join(titles)}"
+                    f"the first line of {path} must have a column {missing_titles[0]!r}, got {', '.join(titles)}"
                 )
             for row in reader:
                 location = f"line {reader.line_num}"

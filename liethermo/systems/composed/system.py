@@ -202,9 +202,10 @@ class ComposedSystem(System):
         def lowest_temperature(x):
             return jnp.min(self.energy.gradient(x)[..., self._state_indices.S])
 
-        return Domain("positive temperatures", self._why_outside, margin=lowest_temperature)
+        return Domain("positive temperatures", self._why_outside_domain, margin=lowest_temperature)
 
-    def _why_outside(self, x) -> str:
+    def _why_outside_domain(self, x) -> str:
+        """Return which temperatures at states are not positive, as a text; "" if all are positive."""
         T = np.atleast_2d(self.temperatures(x)).min(axis=0)
         cold = np.flatnonzero(~(T > 0.0))
         if not cold.size:

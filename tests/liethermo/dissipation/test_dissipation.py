@@ -7,6 +7,7 @@ import pytest
 
 import liethermo as lt
 import manifolds as mf
+from liethermo.dissipation.base import REPLACED_MEMBERS
 from tests.cases import (
     ALGEBRAS,
     DISSIPATIONS,
@@ -264,7 +265,7 @@ def test_a_list_of_dissipations_is_their_sum(parts):
         ([lt.DoubleBracket(0.1), None], r"dissipation\[1\] must be a Dissipation of this library, got NoneType"),
         ([[lt.DoubleBracket(0.1)]], r"dissipation\[0\] must be a Dissipation of this library, got list"),
         ("friction", "a list of them or None, got str"),
-        ([lt.DoubleBracket(0.1), lt.KillingDissipation(0.1)], "KillingDissipation drives the entropy up"),
+        ([lt.DoubleBracket(0.1), lt.KillingDissipation(0.1)], "KillingDissipation increases the entropy"),
     ],
 )
 def test_invalid_lists_of_dissipations(argument, words):
@@ -277,6 +278,17 @@ def test_invalid_lists_of_dissipations(argument, words):
 
 
 # -- controls: what must fail -------------------------------------------------------------------------------------
+
+
+def test_a_dissipation_that_overrides_a_member_by_its_former_name_is_refused():
+    """An override by the former name would have no effect."""
+    assert REPLACED_MEMBERS["velocity"] == "added_attitude_velocity"
+    for name, replacement in REPLACED_MEMBERS.items():
+        assert hasattr(lt.Dissipation, replacement)
+        assert not hasattr(lt.Dissipation, name)
+        with pytest.raises(TypeError, match=rf"^Earlier defines {name}, which nothing calls\. Override {replacement}$"):
+            type("Earlier", (lt.Friction,), {name: None})
+        type("Present", (lt.Friction,), {replacement: getattr(lt.Friction, replacement)})
 
 
 class WrongEnergy(lt.Dissipation):
@@ -469,7 +481,9 @@ def test_a_dissipation_that_extends_another_stays_what_it_is():
 
 @pytest.mark.parametrize("kind", [lt.ProjectedMetric, lt.Friction, lt.FrictionOperator])
 def test_a_rate_in_place_of_a_matrix_is_rejected(kind):
-    with pytest.raises(lt.InputError, match=f"^{kind.__name__} takes .* and 0.3 is a number: for a rate say rate=0.3$"):
+    with pytest.raises(
+        lt.InputError, match=f"^{kind.__name__} takes .*, got the number 0.3. For a rate give rate=0.3$"
+    ):
         kind(0.3)
     assert float(kind(np.eye(3), rate=0.3).rate) == 0.3
 

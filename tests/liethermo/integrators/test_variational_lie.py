@@ -158,7 +158,7 @@ def test_forces_and_heat_from_outside(method, order):
     runs = [lt.integrate(system, x0, (0.0, 2.0), h, method) for h in (0.1, 0.05)]
     errors = [np.abs(run.x[-1] - exact).max() for run in runs]
     assert abs(np.log2(errors[0] / errors[1]) - order) < 0.2, errors
-    assert set(system.ledger) == {"work received", "heat received"}
+    assert set(system.ledger_functions) == {"work received", "heat received"}
     if "energy" in method.preserves:
         assert runs[0].audit().energy_drift < 1e-14
 

@@ -430,7 +430,7 @@ def test_a_csv_file(tmp_path):
         (CSV + "1,2,nan\n", {}, "finite"),
         (CSV + "1,10,3\n", {}, "given twice"),
         (CSV + "1,1,3\n", {}, "with itself"),
-        ("a,b\n1,2\n", {}, "no column 'source'"),
+        ("a,b\n1,2\n", {}, "must have a column 'source', got a, b"),
         ("source,target,conductance\n", {}, "no nodes"),
     ],
 )

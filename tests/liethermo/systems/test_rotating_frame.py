@@ -75,9 +75,12 @@ def test_the_error_of_the_approximation_is_linear_in_the_drive():
 
 def test_what_is_refused():
     frame = lt.RotatingFrame(UPPER_LEVEL)
-    with pytest.raises(lt.InputError, match="no part of the drive is at rest in the frame: its freq"):
+    with pytest.raises(
+        lt.InputError,
+        match="no component of the drive is constant in the frame: the frame turns",
+    ):
         frame.rotating_wave(UPPER_LEVEL, LOWER + LOWER.T, 2.0)
     with pytest.raises(lt.InputError, match=r"components of the frequencies \[-1.0, 1.0\]"):
         frame.jumps([(LOWER + LOWER.T, 0.1)])
-    with pytest.raises(lt.InputError, match=r"has shape \(3, 3\), but the generator of the frame has shape \(2, 2\)"):
+    with pytest.raises(lt.InputError, match=r"generator of the frame, \(2, 2\), got \(3, 3\)"):
         frame.hamiltonian(np.eye(3))

@@ -172,7 +172,7 @@ def test_unusable_arguments(arguments, error, words):
 
 def test_a_run_starts_at_a_positive_temperature():
     system = lt.SimpleClosedSystem(lambda q, v, S: 0.5 * v @ v - S + 0.5 * S**2, 3, friction=0.1, validate=False)
-    with pytest.raises(lt.InputError, match=r"temperature -dL/dS is -1"):
+    with pytest.raises(lt.InputError, match=r"temperature -dL/dS must be positive, got -1"):
         lt.integrate(system, [0.0, 1.0, 2.0], (0.0, 1.0), 0.1)
 
 

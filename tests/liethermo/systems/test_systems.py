@@ -328,7 +328,7 @@ def test_the_report_counts_points_outside_the_domain():
 
 
 class Unstartable(lt.LiePoissonSystem):
-    domain = Domain(why_singular=lambda x: "its gradient is infinite")
+    domain = Domain(why_entropy_gradient_infinite=lambda x: "its gradient is infinite")
 
 
 class UnstartableOnASpace(lt.MetriplecticSystem):
