@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from .errors import FileError
+from .errors import FileError, InputError
 
 PART_SUFFIX = ".part"
 """Suffix of the name of a file that is being written."""
@@ -34,6 +34,14 @@ EXCLUSIVE_WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | SAFE_OPEN_FLAGS
 def available_cores() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def checked_path(path, argument_name: str = "path") -> Path:
+    """Return a user's path as a Path; raise InputError unless it is a string or a path."""
+    try:
+        return Path(path)
+    except TypeError:
+        raise InputError(f"{argument_name} must be a string or a path, got {path!r:.60}") from None
 
 
 def write_atomically(path: Path, data: bytes | memoryview, mode: int = 0o666) -> None:

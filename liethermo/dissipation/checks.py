@@ -15,10 +15,10 @@ from ..functions.conditions import ParameterCondition, checked_numbers, require_
 from ..functions.indices import Indices
 from .geometry import Geometry
 
-NEGATIVE_RATE_MESSAGE = "a dissipation rate must be >= 0, got {value}: a negative rate would lower the entropy"
-"""Message for a rate that is negative or NaN."""
-
-RATE_CONDITION = ParameterCondition(lambda rate: rate >= 0.0, NEGATIVE_RATE_MESSAGE)
+RATE_CONDITION = ParameterCondition(
+    lambda rate: (rate >= 0.0) & (rate < np.inf),
+    "a dissipation rate must be >= 0 and finite, got {value}: a negative rate would lower the entropy",
+)
 """Condition on the rate, or the rates, of a dissipation."""
 
 NEGATIVE_EIGENVALUE_MESSAGE = (
@@ -54,9 +54,7 @@ def checked_rate(rate) -> jax.Array:
 def checked_rates(rates) -> jax.Array:
     """Return a rate, or one for each site, as an array of nonnegative numbers (or traced ones)."""
     array = checked_numbers(rates, "a rate")
-    if not isinstance(array, jax.core.Tracer) and not np.all(np.asarray(array) >= 0.0):
-        min_rate = float(np.asarray(array).min())
-        raise InputError(NEGATIVE_RATE_MESSAGE.format(value=min_rate))
+    RATE_CONDITION.require(array)
     return array
 
 

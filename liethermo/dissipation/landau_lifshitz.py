@@ -21,7 +21,7 @@ from ..errors import InputError
 from ..functions.conditions import checked_numbers, require_condition
 from ..functions.frames import sqrt_or_zero
 from .base import Damping
-from .checks import RATE_CONDITION, checked_bath_indices, checked_rate, checked_rates
+from .checks import RATE_CONDITION, checked_bath_indices, checked_rates
 from .factor import Factor
 
 
@@ -62,8 +62,7 @@ class LandauLifshitz(Damping):
     rate: jax.Array = eqx.field(metadata=RATE_CONDITION.metadata)
 
     def __init__(self, rate=1.0, bath=None):
-        array = checked_numbers(rate, "a rate")
-        self.rate = checked_rate(array) if array.shape == () else checked_rates(array)
+        self.rate = checked_rates(rate)
         self.bath = checked_bath_indices(bath)
 
     @staticmethod

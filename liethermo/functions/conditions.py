@@ -190,6 +190,22 @@ def checked_host_numbers(value, quantity_name: str) -> np.ndarray:
     return _converted_numbers(value, quantity_name, lambda value: np.asarray(value, dtype=np.float64))
 
 
+def host_number(value, quantity_name: str) -> float:
+    """Return a user's number as a float.
+
+    Raises
+    ------
+    InputError
+        If the value is not one real number. A string is none, although ``float`` would convert it.
+    """
+    try:
+        if isinstance(value, str | bytes):
+            raise TypeError("a string")
+        return float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{quantity_name} must be a number, got {value!r:.60}") from None
+
+
 def _converted_numbers(value, quantity_name: str, convert: Callable) -> Any:
     """Return ``convert(value)``; raise InputError unless the value is made of real numbers."""
     try:
@@ -202,6 +218,17 @@ def _converted_numbers(value, quantity_name: str, convert: Callable) -> Any:
         raise InputError(f"{quantity_name} must be made of real numbers, got {description}") from error
 
 
+MAX_PRINTED_ENTRIES = 12
+"""Largest array that a message prints whole: a matrix of rank 3, with some room."""
+
+
 def condition_message(message_template: str, value) -> str:
-    """Return the error message of a condition, from its template with a placeholder for the value."""
-    return message_template.format(value=np.asarray(value).tolist())
+    """Return the error message of a condition, from its template with a placeholder for the value.
+
+    An array of more than :data:`MAX_PRINTED_ENTRIES` numbers is described by its shape and its range.
+    """
+    array = np.asarray(value)
+    if array.size <= MAX_PRINTED_ENTRIES:
+        return message_template.format(value=array.tolist())
+    text = f"an array of shape {array.shape} with numbers from {array.min():.6g} to {array.max():.6g}"
+    return message_template.format(value=text)

@@ -13,6 +13,7 @@ from manifolds._arguments import public_dir
 from manifolds.errors import warn
 
 from ..errors import InputError
+from ..functions.conditions import host_number
 from ..integrators import MetriplecticRungeKutta, OneStepMethod
 from ..results.solution import Solution
 from ..runs.adaptive import Adaptive
@@ -305,7 +306,7 @@ def _smallest_tolerance(name: str, tolerance, x0) -> float:
 
 def _checked_t_span(t_span) -> tuple[float, float]:
     try:
-        start, end = map(float, t_span)
+        start, end = (host_number(t, "t_span") for t in t_span)
     except (TypeError, ValueError):
         raise InputError(f"t_span must be two numbers (start, end), got {t_span!r}") from None
     if math.isnan(start) or math.isnan(end) or math.isinf(start):

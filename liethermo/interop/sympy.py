@@ -240,7 +240,7 @@ def write(problem: dict[str, Any], path: str | os.PathLike) -> Path:
     FileError
         If it cannot be written.
     """
-    path = Path(path)
+    path = disk.checked_path(path)
     text = json.dumps(problem, indent=2, ensure_ascii=False) + "\n"
     with disk.file_errors("write", path):
         disk.write_atomically(path, text.encode())

@@ -13,6 +13,7 @@ import numpy as np
 
 from manifolds._precision import with_library_settings
 
+from ..disk import checked_path
 from ..errors import FileError
 from ..systems import System
 from .training import Training, read_archive, write_archive
@@ -60,7 +61,7 @@ def save(system: System, path: str | os.PathLike) -> Path:
     FileError
         If the file cannot be written.
     """
-    path, training = Path(path), getattr(system, "training", None)
+    path, training = checked_path(path), getattr(system, "training", None)
     arrays = {f"leaf_{i}": np.asarray(leaf) for i, leaf in enumerate(_flatten_array_leaves(system)[0])}
     metadata: dict[str, Any] = {"format": MODEL_FORMAT, "kind": system.kind}
     if training is not None:
@@ -88,7 +89,7 @@ def load(path: str | os.PathLike, system: T) -> T:
     FileError
         If there is no such file, it is damaged, or it holds a system of another structure.
     """
-    metadata, arrays = read_archive(Path(path), MODEL_FORMAT)
+    metadata, arrays = read_archive(checked_path(path), MODEL_FORMAT)
     leaves, structure, static = _flatten_array_leaves(system)
     saved_leaves = [
         arrays.get(f"leaf_{i}", np.zeros(0, bool)) for i in range(sum(n.startswith("leaf_") for n in arrays))

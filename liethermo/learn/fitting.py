@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
@@ -15,6 +14,7 @@ import numpy as np
 from manifolds._precision import with_library_settings
 from manifolds.errors import ManifoldsError, warn
 
+from ..disk import checked_path
 from ..errors import InputError, LiethermoError
 from ..integrators import MetriplecticRungeKutta, OneStepMethod
 from ..systems import System
@@ -348,7 +348,7 @@ def fit(
             repr(settings),
         ),
     )
-    path = None if checkpoint is None else Path(checkpoint)
+    path = None if checkpoint is None else checked_path(checkpoint, "checkpoint")
     if path is not None and path.exists():
         training_run.restore_checkpoint(path)
     training_run.run(seed, patience, path, progress)

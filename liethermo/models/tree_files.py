@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import xml.etree.ElementTree as ElementTree
-from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..disk import checked_path
 from ..errors import FileError, InputError
 from .joints import Hinge, Joint, Slider, Universal
 
@@ -487,8 +487,9 @@ def _read_xml_root(source: str | os.PathLike, root_tag: str, format_name: str) -
     if isinstance(source, str) and source.lstrip().startswith("<"):
         text = source
     else:
+        path = checked_path(source, "the source")
         try:
-            text = Path(source).read_text(encoding="utf-8")
+            text = path.read_text(encoding="utf-8")
         except OSError as error:
             raise FileError(
                 f"cannot read the {format_name} file {os.fspath(source)!r:.200}: {error.strerror}"

@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..disk import checked_path
 from ..errors import FileError, InputError
 from ..systems.rotations import rotation_matrices
 from ..units import parse_unit, split_label
@@ -101,7 +102,7 @@ def write_csv(
     if euler is not None:
         columns.append(euler_angles(solution, euler, degrees))
         names += [f"euler_{euler}_{i} [{'deg' if degrees else 'rad'}]" for i in (1, 2, 3)]
-    path = Path(path)
+    path = checked_path(path)
     try:
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file, lineterminator="\n")
@@ -133,7 +134,7 @@ def read_csv(path: str | os.PathLike) -> AttitudeHistory:
     FileError
         If the file cannot be read, a column is missing, or its numbers are not attitudes.
     """
-    path = Path(path)
+    path = checked_path(path)
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             header, *rows = [row for row in csv.reader(file) if row]

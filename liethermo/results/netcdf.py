@@ -155,7 +155,7 @@ def write_dataset(dataset: xarray.Dataset, path: str | os.PathLike) -> Path:
 
     HDF5 writes it to memory, because it does not survive a full disk.
     """
-    path = Path(path)
+    path = disk.checked_path(path)
     float_names = [name for name, v in dataset.variables.items() if v.dtype.kind == "f" and v.size]
     buffer = io.BytesIO()
     with _use_synchronous_dask():
@@ -193,7 +193,7 @@ def read_variables_and_attributes(path: str | os.PathLike) -> tuple[dict[str, np
     UserWarning
         If an earlier version wrote the file, without a checksum, so that damage might not be noticed.
     """
-    path = Path(path)
+    path = disk.checked_path(path)
     with disk.file_errors("read", path):
         if not path.is_file():
             raise FileError(f"there is no file {path!s:.200}")

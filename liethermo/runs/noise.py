@@ -17,6 +17,7 @@ from manifolds._class_members import ListedType
 from ..dissipation.geometry import divergence_summands_of_fields
 from ..dissipation.noise import factor_check_residuals
 from ..errors import InputError
+from ..functions.conditions import host_number
 from ..functions.energy import Energy, make_energy
 from ..integrators import MetriplecticMidpoint, OneStepMethod
 from ..integrators.fluctuating import stochastic_method
@@ -368,9 +369,6 @@ DEFAULT_NOISE_METHOD = MetriplecticMidpoint()
 
 def _require_nonnegative_number(name: str, value) -> None:
     """Raise InputError unless a value is a finite number >= 0."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} must be a number, got {value!r}") from None
+    number = host_number(value, name)
     if not (0.0 <= number < np.inf):
         raise InputError(f"{name} must be finite and >= 0, got {number:g}")

@@ -40,7 +40,15 @@ from .preparation import (
 from .problem import Problem
 from .progress import Progress
 from .run import Run
-from .schedule import CHUNK_STEPS, ScheduleSegment, StepSchedule, checked_span, checked_step, make_schedule
+from .schedule import (
+    CHUNK_STEPS,
+    ScheduleSegment,
+    StepSchedule,
+    checked_span,
+    checked_step,
+    checked_step_size,
+    make_schedule,
+)
 from .time_features import add_breaks_at_features_or_warn
 from .varied_parameters import VariedParameters
 
@@ -116,6 +124,8 @@ class Propagator(metaclass=ListedType):
         require_system(system, "the first argument must be a system such as lt.LiePoissonSystem")
         check_choice("engine", engine, ENGINES)
         refuse_incompatible_options(method, step, noise)
+        if not isinstance(step, Adaptive):
+            checked_step_size(step)
         self.system, self.method, self.step, self.engine, self.noise = system, method, step, engine, noise
         self._variants: LRUCache[Propagator] = LRUCache(MAX_CACHED_PARAMETER_SETS)
         self._decided_problem: Problem | None = None

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..engines.array_engine import MAX_SAVES_PER_CALL
 from ..errors import InputError
-from ..functions.conditions import checked_host_numbers
+from ..functions.conditions import checked_host_numbers, host_number
 from ..functions.gradients import EPS
 from ..functions.time_span import BREAK_RTOL, TIMES_OF_SMOOTH_FUNCTIONS, DeclaredTimes, checked_breaks
 from .adaptive import Adaptive
@@ -422,7 +422,7 @@ def backward_span_message(start: float, end: float) -> str:
 def checked_span(span, allow_infinite_end: bool = False) -> tuple[float, float]:
     """Return start and end of a span as floats; raise InputError unless they are finite and increasing."""
     try:
-        start, end = (float(t) for t in span)
+        start, end = (host_number(t, "t_span") for t in span)
     except (TypeError, ValueError):
         raise InputError(f"t_span must be two numbers (start, end), got {span!r:.60}") from None
     if not (math.isfinite(start) and end > start and (allow_infinite_end or math.isfinite(end))):
@@ -436,14 +436,17 @@ def checked_span(span, allow_infinite_end: bool = False) -> tuple[float, float]:
     return start, end
 
 
-def checked_step(step, start: float, end: float) -> float:
-    """Return the step size as a float; raise InputError unless it is positive and above the rounding of the times."""
-    try:
-        h = float(step)
-    except (TypeError, ValueError):
-        raise InputError(f"step must be a number, got {step!r}") from None
+def checked_step_size(step) -> float:
+    """Return the step size as a float; raise InputError unless it is positive and finite."""
+    h = host_number(step, "step")
     if not (math.isfinite(h) and h > 0.0):
         raise InputError(f"step must be positive and finite, got {h:g}")
+    return h
+
+
+def checked_step(step, start: float, end: float) -> float:
+    """Return the step size as a float; raise InputError unless it is positive and above the rounding of the times."""
+    h = checked_step_size(step)
     if start + h == start or end + h == end:
         raise InputError(
             f"step {h:g} is below the rounding of the times {start:g} and {end:g} in double precision. Give a larger "

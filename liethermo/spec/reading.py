@@ -277,7 +277,7 @@ def read(
     SpecError
         With all faults of the file.
     """
-    path = Path(path)
+    path = disk.checked_path(path)
     table = _parse_file(path)
     problems: list[str] = []
     for change in changes:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..disk import checked_path
 from ..errors import FileError
 from ..results.audit import Audit, AuditRow, Tolerances, check_laws
 from ..results.netcdf import dataclass_from_json
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 def load_status(path: Any) -> StudyStatus:
     """Return the progress of a study, with the number of points by status, read from the path of its store."""
-    return store_status(StudyStore.open(Path(path)))
+    return store_status(StudyStore.open(checked_path(path)))
 
 
 def store_status(store: StudyStore) -> StudyStatus:
@@ -42,7 +43,7 @@ def load_study(path: Any) -> xarray.Dataset:
     FileError
         If there is no store, or it was changed; on access, if a file is missing or damaged.
     """
-    return open_results(Path(path), None)
+    return open_results(checked_path(path), None)
 
 
 def open_results(path: Path, keep_alive: object) -> xarray.Dataset:
@@ -67,7 +68,7 @@ def open_results(path: Path, keep_alive: object) -> xarray.Dataset:
 def audit_store(path: Any, **tolerances: float) -> Audit:
     """Return an audit of all points of a store, each law by its worst point."""
     accepted_tolerances = Tolerances.with_defaults(**tolerances)
-    store = StudyStore.open(Path(path))
+    store = StudyStore.open(checked_path(path))
     axes, laws = store.read_axes(), dataclass_from_json(Laws, store.attributes["laws"])
     worst_rows: dict[str, tuple[float, AuditRow]] = {}
     min_entropy_increment, drift, residual = math.inf, 0.0, 0.0

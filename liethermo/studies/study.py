@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -15,6 +14,7 @@ from manifolds._class_members import ListedType
 from manifolds._precision import with_library_settings
 from manifolds.errors import warn
 
+from ..disk import checked_path
 from ..engines.status_codes import StatusCode
 from ..errors import InputError
 from ..integrators import OneStepMethod
@@ -182,7 +182,7 @@ class Study(metaclass=ListedType):
         if store is None:
             self._temporary_folder = store_metadata.TemporaryFolder()
             store = self._temporary_folder.path / "study.zarr"
-        self.store = Path(store)
+        self.store = checked_path(store, "store")
         parameters = self._axes.parameter_names
         self._task = StudyTask(
             system_builder(build, parameters), parameters, x0, attitude, (schedule.start, schedule.end), step, method,

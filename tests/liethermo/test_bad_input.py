@@ -9,6 +9,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.models.gases import porous_piston_state
+from tests.refusals import refusal_test
 
 V = lt.VariationalIntegrator
 D = lt.DiscreteHerglotz
@@ -201,3 +202,30 @@ def test_bad_input_is_one_line(case):
         call()
     assert isinstance(caught.value, ValueError | TypeError)
     assert "\n" not in str(caught.value)
+
+
+def solution():
+    return lt.integrate(lt.models.rigid_body((3.0, 2.0, 1.0)), [0.1, 0.2, 1.0], (0.0, 0.1), 0.1)
+
+
+def study(**options):
+    axes = {"a": [1.0]}
+    measure = {"q": lambda solution: solution.x[-1, 0]}
+    return lt.Study(oscillator(), axes, t_span=(0.0, 1.0), step=0.1, measure=measure, x0=[1.0, 0.0, 0.0], **options)
+
+
+test_a_path_must_be_a_string_or_a_path = refusal_test(
+    {
+        "load": (lambda: lt.load(3), "path must be a string or a path, got 3"),
+        "load_study": (lambda: lt.load_study(3), "path must be a string or a path, got 3"),
+        "Solution.save": (lambda: solution().save(None), "path must be a string or a path, got None"),
+        "Study": (lambda: study(store=3), "store must be a string or a path, got 3"),
+        "read_graph": (lambda: lt.read_graph(3), "path must be a string or a path, got 3"),
+        "Tree.from_urdf": (lambda: lt.bodies.Tree.from_urdf(3), "the source must be a string or a path, got 3"),
+        "read_csv": (lambda: lt.bodies.read_csv(3), "path must be a string or a path, got 3"),
+        "read_ovf": (lambda: lt.magnetism.read_ovf(3), "path must be a string or a path, got 3"),
+        "learn.save": (lambda: lt.learn.save(oscillator(), 3), "path must be a string or a path, got 3"),
+        "learn.load": (lambda: lt.learn.load(3, oscillator()), "path must be a string or a path, got 3"),
+        "plot": (lambda: lt.plot.laws(solution(), path=3), "path must be a string or a path, got 3"),
+    }
+)

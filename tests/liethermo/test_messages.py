@@ -216,6 +216,8 @@ def test_times_that_are_a_rounding_beyond_the_end_are_the_end():
         ({"save_at": [0.5, 1.5]}, r"save_at must be times of t_span = \(0, 1\), got 1.5, outside of it"),
         ({"save_at": [0.5], "save_every": 0}, "save_every must be a positive integer"),
         ({"step": 0.0}, "step must be positive and finite, got 0$"),
+        ({"step": "0.1"}, "step must be a number, got '0.1'"),
+        ({"span": ("0", "1")}, r"t_span must be two numbers \(start, end\), got \('0', '1'\)"),
         ({"span": 1.0}, r"t_span must be two numbers \(start, end\), got 1.0"),
         ({"span": 1.0, "step": lt.Adaptive(1e-6)}, r"t_span must be two numbers \(start, end\), got 1.0"),
         ({"span": "ab", "step": lt.Adaptive(1e-6)}, r"t_span must be two numbers \(start, end\), got 'ab'"),

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import os
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from ...disk import checked_path
 from ...errors import FileError, InputError
 from ..conditions import checked_host_numbers
 
@@ -65,14 +65,14 @@ def read_ovf(path) -> VectorField:
     FileError
         If the file is not a rectangular OVF file, or is damaged.
     """
-    name = os.fspath(path)
+    path = checked_path(path)
     try:
-        content = Path(name).read_bytes()
+        content = path.read_bytes()
     except OSError as error:
-        raise FileError(f"{name} could not be read: {error}") from error
-    version, header, kind, start = _parse_header(content, name)
+        raise FileError(f"{path} could not be read: {error}") from error
+    version, header, kind, start = _parse_header(content, path)
     if header.get("meshtype", "rectangular").lower() != "rectangular":
-        raise FileError(f"{name} has an irregular mesh. Only rectangular meshes are read")
+        raise FileError(f"{path} has an irregular mesh. Only rectangular meshes are read")
     try:
         nodes = tuple(int(header[f"{axis}nodes"]) for axis in "xyz")
         size = float(header["xstepsize"]), float(header["ystepsize"]), float(header["zstepsize"])
@@ -80,18 +80,18 @@ def read_ovf(path) -> VectorField:
         dim = int(header["valuedim"]) if version == 2 else 3
         factor = float(header.get("valuemultiplier", 1.0)) if version == 1 else 1.0
     except KeyError as error:
-        raise FileError(f"{name} has no valid header: the entry {error} is missing") from error
+        raise FileError(f"{path} has no valid header: the entry {error} is missing") from error
     except ValueError as error:
-        raise FileError(f"{name} has no valid header: {error}") from error
+        raise FileError(f"{path} has no valid header: {error}") from error
     if min(*nodes, dim) < 1:
-        raise FileError(f"{name} must have positive numbers of cells and components, got {nodes} and {dim}")
+        raise FileError(f"{path} must have positive numbers of cells and components, got {nodes} and {dim}")
     if not (min(size) > 0.0 and np.isfinite((*size, *origin, factor)).all()):
         raise FileError(
-            f"{name} must have positive edges of cells and finite numbers in its header, got the edges {size}, the "
+            f"{path} must have positive edges of cells and finite numbers in its header, got the edges {size}, the "
             f"origin {origin} and the multiplier {factor:g}"
         )
     count = math.prod(nodes) * dim
-    data = _read_data(content, start, kind, version, count, name)
+    data = _read_data(content, start, kind, version, count, path)
     values = factor * data.reshape(*nodes[::-1], dim).transpose(2, 1, 0, 3)
     unit = _first_list_entry(header.get("valueunits", "")) if version == 2 else header.get("valueunit", "")
     title, length_unit = header.get("title", ""), header.get("meshunit", "m")
@@ -170,10 +170,11 @@ def write_ovf(
         body = np.concatenate([[CHECK_VALUES[width]], flat.ravel()]).astype(dtype).tobytes() + b"\n"
     head = "".join(f"# {line}\n" for line in [*lines, f"Begin: Data {kind}"])
     tail = f"# End: Data {kind}\n# End: Segment\n"
+    path = checked_path(path)
     try:
-        Path(os.fspath(path)).write_bytes(head.encode() + body + tail.encode())
+        path.write_bytes(head.encode() + body + tail.encode())
     except OSError as error:
-        raise FileError(f"{os.fspath(path)} could not be written: {error}") from error
+        raise FileError(f"{path} could not be written: {error}") from error
 
 
 def _header_lines(array: np.ndarray, edges, base, version: int, title: str, unit: str) -> list[str]:
@@ -212,7 +213,7 @@ def _first_list_entry(text: str) -> str:
     return text.split(" ")[0]
 
 
-def _parse_header(content: bytes, file_name: str) -> tuple[int, dict[str, str], str, int]:
+def _parse_header(content: bytes, path: Path) -> tuple[int, dict[str, str], str, int]:
     """Return the version, the entries of the header, the kind of the data, and where they begin."""
     header: dict[str, str] = {}
     position, version = 0, 0
@@ -222,7 +223,7 @@ def _parse_header(content: bytes, file_name: str) -> tuple[int, dict[str, str], 
         line = _decode_line(content[position:end]).strip()
         position = end + 1
         if not version:
-            version = _version_of_line(line, file_name)
+            version = _version_of_line(line, path)
             continue
         text = line.lstrip("#").split("##")[0].strip()
         key, _, value = text.partition(":")
@@ -230,7 +231,7 @@ def _parse_header(content: bytes, file_name: str) -> tuple[int, dict[str, str], 
         if key == "begin" and value.strip().lower().startswith("data"):
             return version, header, " ".join(value.lower().split()[1:]), position
         header.setdefault(key, value.strip())
-    raise FileError(f"{file_name} has no data: the line '# Begin: Data' is missing")
+    raise FileError(f"{path} has no data: the line '# Begin: Data' is missing")
 
 
 def _decode_line(line: bytes) -> str:
@@ -241,7 +242,7 @@ def _decode_line(line: bytes) -> str:
         return line.decode("latin-1")
 
 
-def _version_of_line(line: str, file_name: str) -> int:
+def _version_of_line(line: str, path: Path) -> int:
     """Return the OVF version, 1 or 2, that the first line of a file names; raise FileError for another line."""
     text = line.lstrip("# ").lower()
     if text.startswith("oommf"):
@@ -249,12 +250,10 @@ def _version_of_line(line: str, file_name: str) -> int:
             return 2
         if "v1.0" in text or text.endswith("1.0") or "v0.99" in text:
             return 1
-    raise FileError(f"{file_name} is not an OVF file of version 1.0 or 2.0: its first line is {line[:60]!r}")
+    raise FileError(f"{path} is not an OVF file of version 1.0 or 2.0: its first line is {line[:60]!r}")
 
 
-def _read_data(
-    content: bytes, data_start: int, data_kind: str, version: int, n_numbers: int, file_name: str
-) -> np.ndarray:
+def _read_data(content: bytes, data_start: int, data_kind: str, version: int, n_numbers: int, path: Path) -> np.ndarray:
     """Return ``n_numbers`` numbers from the data of an OVF file, from ``data_start`` on; raise FileError if damaged."""
     if data_kind == "text":
         end = content.find(b"#", data_start)
@@ -262,24 +261,24 @@ def _read_data(
         try:
             numbers = np.array(words, dtype=float)
         except ValueError as error:
-            raise FileError(f"{file_name} has data that are not numbers: {error}") from error
+            raise FileError(f"{path} has data that are not numbers: {error}") from error
         if len(numbers) != n_numbers:
             cause = "The file is not complete" if len(numbers) < n_numbers else "Its header does not fit its data"
-            raise FileError(f"{file_name} must have {n_numbers} numbers, got {len(numbers)}. {cause}")
+            raise FileError(f"{path} must have {n_numbers} numbers, got {len(numbers)}. {cause}")
         return numbers
     if data_kind not in ("binary 4", "binary 8"):
-        raise FileError(f"{file_name} has data of the kind {data_kind!r}. Text, binary 4 and binary 8 are read")
+        raise FileError(f"{path} has data of the kind {data_kind!r}. Text, binary 4 and binary 8 are read")
     width = int(data_kind[-1])
     if len(content) < data_start + width * (n_numbers + 1):
-        raise FileError(f"{file_name} is not complete: it must have {n_numbers} numbers of {width} bytes")
+        raise FileError(f"{path} is not complete: it must have {n_numbers} numbers of {width} bytes")
     following_text = content[data_start + width * (n_numbers + 1) :].lstrip()
     if following_text and not following_text.startswith(b"#"):
         raise FileError(
-            f"{file_name} has more data than the {n_numbers} numbers of {width} bytes of its header. Its header does "
+            f"{path} has more data than the {n_numbers} numbers of {width} bytes of its header. Its header does "
             "not fit its data"
         )
     for order in "<>" if version == 2 else "><":
         numbers = np.frombuffer(content, dtype=np.dtype(f"{order}f{width}"), count=n_numbers + 1, offset=data_start)
         if numbers[0] == CHECK_VALUES[width]:
             return numbers[1:].astype(float)
-    raise FileError(f"{file_name} is damaged: its data do not begin with the number {CHECK_VALUES[width]:.0f}")
+    raise FileError(f"{path} is damaged: its data do not begin with the number {CHECK_VALUES[width]:.0f}")

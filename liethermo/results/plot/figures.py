@@ -28,11 +28,14 @@ GREY = "0.55"
 
 def checked_figure_path(path: str | os.PathLike | None) -> Path | None:
     """Return the path of a figure; InputError if its suffix is not one of SUFFIXES."""
-    if path is not None and Path(path).suffix.lower() not in SUFFIXES:
+    if path is None:
+        return None
+    path = disk.checked_path(path)
+    if path.suffix.lower() not in SUFFIXES:
         raise InputError(
-            f"the suffix of path must be one of {', '.join(SUFFIXES)}, but {Path(path).name!r} ends in none of them"
+            f"the suffix of path must be one of {', '.join(SUFFIXES)}, but {path.name!r} ends in none of them"
         )
-    return None if path is None else Path(path)
+    return path
 
 
 def save_figure(figure: Figure, path: Path | None) -> Figure:

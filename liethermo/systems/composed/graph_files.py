@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import scipy
 
+from ...disk import checked_path
 from ...errors import FileError, InputError
 from ...functions.edges import graph_edges
 
@@ -65,7 +66,7 @@ def read_graph(path: str | os.PathLike, weight: str = "conductance", nodes: Sequ
         If an edge leads to a node that is missing, is given twice, or has no weight, or one that is negative or not
         finite.
     """
-    path = Path(path)
+    path = checked_path(path)
     if not path.is_file():
         raise FileError(f"there is no file {path}")
     readers = {".csv": _read_csv, ".graphml": _read_graphml}

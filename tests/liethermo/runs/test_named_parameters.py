@@ -211,7 +211,7 @@ CONDITIONS = {
     "reservoir": (_spin_with_reservoir, "baths.temperature", [-1.0], "temperature of a bath must be positive"),
     "damping": (_friction_system, "dissipation.D", [[1.0, 2.0], [2.0, 1.0]], "must be symmetric and positive semi"),
     "not symmetric": (_friction_system, "dissipation.D", [[1.0, 0.5], [0.0, 1.0]], "must be symmetric and positive"),
-    "jumps": (qubit, "dissipation.rates[0]", -0.1, "rate must be >= 0"),
+    "jumps": (qubit, "dissipation.rates[0]", -0.1, "rate must be >= 0 and finite"),
 }
 """Systems with a parameter, a value that its constructor refuses, and the message."""
 

@@ -133,8 +133,8 @@ BATHS_OF_TWO_KINDS = lt.HeatBaths([1.0, 2.0], [1.0, 0.5])
 @pytest.mark.parametrize(
     ("name", "invalid", "valid", "message"),
     [
-        ("dissipation.rate", -1.0, 0.3, r"a dissipation rate must be >= 0, got -1"),
-        ("dissipation.rate", np.nan, 0.3, r"a dissipation rate must be >= 0, got nan"),
+        ("dissipation.rate", -1.0, 0.3, r"a dissipation rate must be >= 0 and finite, got -1"),
+        ("dissipation.rate", np.nan, 0.3, r"a dissipation rate must be >= 0 and finite, got nan"),
         ("baths.capacity", [1.0, -2.0], [0.5, 2.0], r"the capacity of a bath must be positive, got \[1\.0, -2\.0\]"),
         ("baths.temperature", [0.0, 1.0], [0.5, 2.0], r"the temperature of a bath must be positive"),
     ],
@@ -226,8 +226,9 @@ test_bad_arguments = refusal_test(
     (lambda: lt.Propagator("body", None, 0.1), "the first argument must be a system"),
     (lambda: lt.Propagator(rigid_body(), None, 0.1, engine="gpu"), "engine must be"),
     (lambda: lt.Propagator(rigid_body(), lt.Reference(), lt.Adaptive(1e-8)), "Reference chooses its own steps"),
-    (lambda: lt.Propagator(rigid_body(), None, -0.1).final(MU, SPAN), "step must be positive"),
-    (lambda: lt.Propagator(rigid_body(), None, None).final(MU, SPAN), "step must be a number"),
+    (lambda: lt.Propagator(rigid_body(), None, -0.1), "step must be positive"),
+    (lambda: lt.Propagator(rigid_body(), None, None), "step must be a number, got None"),
+    (lambda: lt.Propagator(rigid_body(), None, "0.1"), "step must be a number, got '0.1'"),
     (lambda: lt.Propagator(rigid_body(), None, 0.1).final(MU, (1.0, 0.0)), "t_span must be finite and increasing"),
     (lambda: lt.Propagator(rigid_body(), None, 0.1).final(MU[:2], SPAN), "a state of this system must have shape"),
     (lambda: lt.Propagator(rigid_body(), None, 0.1).final(MU * np.nan, SPAN), "the state is not finite"),

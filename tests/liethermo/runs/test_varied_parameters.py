@@ -216,7 +216,7 @@ def test_values_that_cannot_be_used_are_refused():
             propagator.final(MU, SPAN, parameters={"dissipation.rate": [0.7, 0.1]})
         with pytest.raises(lt.InputError, match="moments of inertia must be positive and finite, got"):
             propagator.final(MU, SPAN, parameters={"energy.inertia": [np.nan, 2.0, 1.0]})
-        with pytest.raises(lt.InputError, match="a dissipation rate must be >= 0, got nan"):
+        with pytest.raises(lt.InputError, match="a dissipation rate must be >= 0 and finite, got nan"):
             propagator.final(MU, SPAN, parameters={"dissipation.rate": np.nan})
         with pytest.raises(lt.InputError, match="a state of this system must have shape"):
             propagator.final(MU[:2], SPAN, parameters={"dissipation.rate": 0.4})

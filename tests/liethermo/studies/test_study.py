@@ -59,7 +59,7 @@ def test_a_parameter_that_is_refused_is_the_status_of_its_points(finished_study)
     codes = dict(zip(results.status.flag_meanings.split(), results.status.flag_values, strict=True))
     assert (bad.status == codes["inadmissible"]).all()
     assert set(bad.message.values.tolist()) == {
-        "a dissipation rate must be >= 0, got -1.0: a negative rate would lower the entropy"
+        "a dissipation rate must be >= 0 and finite, got -1.0: a negative rate would lower the entropy"
     }
     assert np.isnan(bad.tau).all()
     assert np.isnan(bad.final).all()

@@ -406,7 +406,12 @@ REFUSED_CALLS = [
     (lambda: lt.SpinSystem(3, mag.exchange(4, 1.0)), "a term of 4 spins"),
     (lambda: lt.SpinSystem(3, mag.exchange(3), lt.LandauLifshitz(np.ones(4))), r"have the shape \(3,\) of the sites"),
     (lambda: lt.SpinSystem(3, mag.exchange(3), lt.LandauLifshitz(-1.0)), "must be >= 0"),
-    (lambda: lt.LandauLifshitz([0.1, -0.2]), "must be >= 0, got -0.2"),
+    (lambda: lt.LandauLifshitz([0.1, -0.2]), r"must be >= 0 and finite, got \[0.1, -0.2\]"),
+    (lambda: lt.LandauLifshitz(np.inf), "must be >= 0 and finite, got inf"),
+    (
+        lambda: lt.LandauLifshitz(np.linspace(-1.0, 1.0, 1000)),
+        r"got an array of shape \(1000,\) with numbers from -1 to 1:",
+    ),
     (lambda: small_lattice(bath=np.array([0, 0, 1])), "a dissipation heats bath 1, but there are 1 baths"),
     (lambda: small_lattice(bath=np.array([0, 0])), "of the shape .3,. of the sites"),
     (lambda: lt.HeatBaths(-1.0), r"must be positive, got \[-1.0\]"),
