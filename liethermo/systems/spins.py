@@ -58,8 +58,7 @@ class SpinSystem(TorqueSystem):
 
     A state is ``(s_1, s_2, …, y_1, …, y_m)`` in one row: the spins site by site in C order, then the entropy of each
     bath. Baths have the energy ``U(y)``, the temperatures ``T_b = dU/dy_b`` and the entropy ``sum y_b``. Every
-    |s_i| is constant, to rounding, with every method of this library: no charts are needed, and memory and time of a
-    step grow with the number of sites.
+    |s_i| is constant, to rounding, with every method. Memory and time of a step grow with the number of sites.
 
     Parameters
     ----------
