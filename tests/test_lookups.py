@@ -42,7 +42,7 @@ FOREIGN = {
 
 OURS = {
     ("liethermo/learn/files.py", "training"): "what a fit has put beside a system",
-    ("liethermo/functions/on_spaces.py", "dim"): "of a Casimir, which may be any function that knows its dimension",
+    ("liethermo/functions/flat_states.py", "dim"): "of a Casimir, which may be any function that knows its dimension",
 }
 
 

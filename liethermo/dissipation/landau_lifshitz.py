@@ -5,6 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from manifolds.structures.spins import (
     Spins,
@@ -17,7 +18,7 @@ from manifolds.structures.spins import (
 )
 
 from ..errors import InputError
-from ..functions.conditions import checked_numbers
+from ..functions.conditions import checked_numbers, require_condition
 from ..functions.frames import sqrt_or_zero
 from .base import Damping
 from .checks import RATE_CONDITION, checked_bath_indices, checked_rates
@@ -66,8 +67,22 @@ class LandauLifshitz(Damping):
 
     @staticmethod
     def gilbert(alpha, ratio=1.0) -> tuple[jax.Array, jax.Array]:
-        """Return the pair (ratio, rate) of Landau and Lifshitz' form, from the alpha and ratio of Gilbert's form."""
+        """Return the pair (ratio, rate) of Landau and Lifshitz' form, from the alpha and ratio of Gilbert's form.
+
+        The damping ``alpha s x s'`` of Gilbert's form lowers the energy if alpha and ratio have one sign.
+
+        Raises
+        ------
+        InputError
+            If ``alpha ratio`` is negative or not finite.
+        """
         alpha, ratio = checked_numbers(alpha, "alpha"), checked_numbers(ratio, "ratio")
+        require_condition(
+            alpha * ratio,
+            lambda a: (a >= 0.0) & (a < np.inf),
+            "alpha ratio must be >= 0 and finite, got {value}; otherwise the damping raises the energy. With ratio < 0 "
+            "give alpha < 0",
+        )
         return ratio / (1.0 + alpha**2), alpha * ratio / (1.0 + alpha**2)
 
     entropy_law = "conserved"

@@ -688,14 +688,14 @@ def function_name(energy: Energy) -> str:
 
 
 def make_energy(function, role: str) -> Energy:
-    """Return an :class:`Energy` from an energy, a list of energies, a Casimir polynomial or a function.
+    """Return an :class:`Energy` from an energy, a Casimir polynomial, a function, or a list of them, which is a sum.
 
     A polynomial becomes quadratic if possible. A function that needs two arguments is one of the state and the time.
     """
     if isinstance(function, Energy):
         return function
-    if isinstance(function, list) and function and all(isinstance(term, Energy) for term in function):
-        return Sum(tuple(summand for term in function for summand in term.terms))
+    if isinstance(function, list) and function:
+        return Sum(tuple(summand for term in function for summand in make_energy(term, f"each term of {role}").terms))
     if isinstance(function, mf.Polynomial) and function.degree <= 2:
         return quadratic_from_polynomial(function)
     if callable(function):

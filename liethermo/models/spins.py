@@ -5,6 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._arrays import is_traced
+
 from ..dissipation.landau_lifshitz import LandauLifshitz
 from ..errors import InputError
 from ..functions.conditions import checked_numbers
@@ -88,9 +90,11 @@ def spin_lattice(
     """
     shape = lattice_shape(sites)
     terms: list[Energy] = [*exchange(shape, exchange_constant, periodic=periodic).terms]
-    if np.any(anisotropy_constant):
-        terms.append(anisotropy(shape, anisotropy_constant, axis))
-    if np.any(field):
+    K = checked_numbers(anisotropy_constant, "an anisotropy constant")
+    if _may_be_nonzero(K):
+        terms.append(anisotropy(shape, K, axis))
+    field = checked_numbers(field, "a field")
+    if _may_be_nonzero(field):
         terms.append(zeeman(shape, field))
     if dmi is not None:
         terms += dzyaloshinskii_moriya(shape, dmi, periodic=periodic).terms
@@ -101,6 +105,11 @@ def spin_lattice(
         )
     lattice_baths = HeatBaths(capacity=float(np.prod(shape))) if baths is True else baths or None
     return SpinSystem(shape, Sum(tuple(terms)), LandauLifshitz(rate, bath), lattice_baths)
+
+
+def _may_be_nonzero(value) -> bool:
+    """Return whether an array has an entry that is not zero; True for a traced array, whose entries are not known."""
+    return is_traced(value) or bool(np.any(value))
 
 
 def _third_axis_vector(field):
@@ -140,7 +149,7 @@ def micromagnet(
         Exchange stiffness A (J / m).
     alpha : float >= 0
         Gilbert's damping constant.
-    anisotropy_constant : float
+    anisotropy_constant : float, or array of the shape of the cells
         Uniaxial constant K (J / m³).
     axis : array, shape (3,)
         Axis of the anisotropy, a unit vector.
@@ -177,12 +186,16 @@ def micromagnet(
     M = checked_numbers(saturation, "the saturation magnetisation", ())
     moment = M * box.cell_volume
     terms: list[Energy] = [continuum_exchange(box, stiffness)]
-    if np.any(anisotropy_constant):
-        terms.append(anisotropy(box, anisotropy_constant * box.cell_volume, axis))
-    if callable(field) or np.any(field):
+    K = checked_numbers(anisotropy_constant, "an anisotropy constant")
+    if _may_be_nonzero(K):
+        terms.append(anisotropy(box, K * box.cell_volume, axis))
+    if not callable(field):
+        field = checked_numbers(field, "a field")
+    if callable(field) or _may_be_nonzero(field):
         terms.append(zeeman(box, field, moment))
-    if np.any(dmi):
-        terms.append(continuum_antisymmetric_exchange(box, dmi, dmi_kind))
+    D = checked_numbers(dmi, "a Dzyaloshinskii-Moriya constant", ())
+    if _may_be_nonzero(D):
+        terms.append(continuum_antisymmetric_exchange(box, D, dmi_kind))
     if demagnetising:
         terms.append(demagnetisation(box, M))
     motion = units("SI").gilbert(alpha, moment, g)

@@ -93,7 +93,7 @@ def ensemble(
         parameters, such as ``{"dissipation.rate": rates}``, to their values.
     outputs : {"final", "trajectory", "summary"}
         Final states; every ``save_every``-th state, or those at ``save_at``; or no states, which saves memory. By
-        default final states, or trajectories with ``save_at``.
+        default final states, or trajectories with ``save_at`` or another ``save_every`` than 1.
     engine : {"auto", "array", "compiled"}
         SIMD lanes over all cores for small systems ("compiled"), or ``vmap`` for any ("array"). "auto" compiles what
         can be compiled, unless JAX has an accelerator.
@@ -128,7 +128,7 @@ def ensemble(
     """
     start_time = time.perf_counter()
     method = checked_or_default_method(method, noise)
-    outputs = outputs or ("final" if save_at is None else "trajectory")
+    outputs = outputs or ("final" if save_at is None and save_every == 1 else "trajectory")
     check_choice("outputs", outputs, ("final", "trajectory", "summary"))
     check_choice("engine", engine, ("auto", "array", "compiled"))
     if save_at is not None and outputs != "trajectory":

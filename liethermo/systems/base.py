@@ -22,7 +22,8 @@ from ..errors import InputError
 from ..functions.bath_energy import BodyBathsEnergy
 from ..functions.checks import checked_energy, trace_energies, with_polynomial_degrees
 from ..functions.energy import Energy, make_energy
-from ..functions.on_spaces import energy_of_vectors, functions_of_flat_states
+from ..functions.flat_states import functions_of_flat_states
+from ..functions.on_spaces import energy_of_vectors
 from ..tracing.short_form import callable_name, format_arguments
 from ..tracing.traced import trace_callables
 from .baths import ABSENT_BATHS, BathEntropy, HeatBaths, checked_baths, poisson_with_baths

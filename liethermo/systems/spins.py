@@ -23,15 +23,16 @@ from ..dissipation.heating import BathConduction, Heating
 from ..dissipation.landau_lifshitz import LandauLifshitz
 from ..errors import InputError
 from ..functions.checks import traced_function_and_shape
+from ..functions.conditions import checked_numbers, nonnegative_condition, positive_condition
 from ..functions.energy import Energy
-from ..functions.magnetism.spin_energy import lattice_shape
+from ..functions.flat_states import functions_of_flat_states
+from ..functions.magnetism.spin_energy import check_finite, checked_site_values, lattice_shape
 from ..functions.magnetism.spin_torques import checked_spin_torque
 from ..functions.on_spaces import (
     HalfSquareOfSpin,
     HalfSumOfSquares,
     SphereLengths,
     energy_in_component_order,
-    functions_of_flat_states,
     interaction_range,
     spins_to_component_order,
     spins_to_site_order,
@@ -56,15 +57,14 @@ class SpinSystem(TorqueSystem):
     They obey the Landau-Lifshitz equation: ``s_i' = gamma_i s_i x grad_i H`` at every site i, plus damping.
 
     A state is ``(s_1, s_2, …, y_1, …, y_m)`` in one row: the spins site by site in C order, then the entropy of each
-    bath. Baths have the energy ``U(y)``, and ``T_b = dU/dy_b`` is their temperature; energy and entropy of the whole
-    are ``H(s) + U(y)`` and ``sum y_b``. Every |s_i| is constant, to rounding, with every method of this library: no
-    charts are needed, and memory and time of a step grow with the number of sites.
+    bath. Baths have the energy ``U(y)``, the temperatures ``T_b = dU/dy_b`` and the entropy ``sum y_b``. Every
+    |s_i| is constant, to rounding, with every method. Memory and time of a step grow with the number of sites.
 
     Parameters
     ----------
     sites : int or tuple of int
         Number of spins, or the shape of their lattice.
-    energy : Energy or function from s, shape ``(*sites, 3)``, to a scalar
+    energy : Energy, function from s, shape ``(*sites, 3)``, to a scalar, or list of them
         Such as a sum of the terms in ``lt.magnetism``. May depend on time.
     dissipation : LandauLifshitz, or a list of dissipations that act together; optional
         The damping; without it the spins precess only.
@@ -119,7 +119,8 @@ class SpinSystem(TorqueSystem):
         self.torque = None if torque is None else checked_spin_torque(torque, self.lattice)
         self.torque_arguments = None
         self.powered_baths, self.power = _checked_powers(power, checked_baths(baths))
-        poisson = mf.Spins(self.lattice, ratio=ratio)
+        ratios = checked_site_values(ratio, self.lattice, (), "ratio")
+        poisson = mf.Spins(self.lattice, ratio=ratios)
         self._build(poisson, poisson.dim, energy, None, dissipation, momentum_maps, validate, baths=baths)
 
     def energy_of_flat_states(self, energy: Energy) -> Energy:
@@ -200,11 +201,14 @@ class SpinSystem(TorqueSystem):
         u = scale_vectors(1.0 / (c * c + dot_vectors(a, a)), u)
         return spins.join_state(add_vectors(slopes, u), entropy_rates)
 
-    def largest_step(self, x, angle: float = 0.3, boltzmann: float = 0.0, t: float = 0.0) -> float:
+    def largest_step(
+        self, x, angle: float = 0.3, boltzmann: float = 0.0, t: float = 0.0, temperature: float | None = None
+    ) -> float:
         """Return the largest step (time) in which no spin turns by more than an ``angle``, in its field or by noise.
 
-        A spin turns at the rate ``sqrt(ratio^2 + (rate |s|)^2) |grad_i H|`` at most. Noise turns it by angles of the
-        variance ``2 k T rate h`` in each component, which is kept below the square of the angle.
+        A spin turns at the rate ``sqrt(ratio^2 + (rate |s|)^2) |grad_i H|`` at most, and torques ``s x w`` add
+        ``|s x w| / |s|``. Noise turns it by angles of the variance ``2 k T rate h`` in each component, which is kept
+        below the square of the angle.
 
         Parameters
         ----------
@@ -214,13 +218,18 @@ class SpinSystem(TorqueSystem):
         boltzmann : float >= 0
             k, as of ``lt.Fluctuations``, for steps with noise; the temperatures are those of the baths.
         t : float
-            The time, for an energy or a temperature that depends on it.
+            The time, for an energy, a torque or a temperature that depends on it.
+        temperature : float > 0, optional
+            The temperature of the noise of a system without baths, as of ``lt.Fluctuations``.
 
         Raises
         ------
         InputError
-            If no spin turns.
+            If no spin turns, an argument is out of its range, or the temperature of the noise is missing.
         """
+        positive_condition("the angle").require(checked_numbers(angle, "the angle", ()))
+        nonnegative_condition("boltzmann").require(checked_numbers(boltzmann, "boltzmann", ()))
+        check_finite(checked_numbers(t, "the time", ()), "the time")
         state, spins, n = self.state(x), self._spin_structure, self.body_dim
         assert spins is not None
         system = self.at_time(t)
@@ -229,14 +238,38 @@ class SpinSystem(TorqueSystem):
         parts = _split_damping(self.total_dissipation)
         rate = np.zeros(()) if parts is None else np.abs(np.asarray(parts.damping.rate)).ravel()
         damping_rate = rate * np.linalg.norm(s, axis=1)
-        turning_rate = float((np.hypot(np.ravel(spins.ratio), damping_rate) * field).max())
+        turning_rates = np.hypot(np.ravel(spins.ratio), damping_rate) * field
+        if self.torque:
+            shape = (*self.lattice, 3)
+            w = sum(
+                np.broadcast_to(np.asarray(term(jnp.asarray(t, float), s.reshape(shape))), shape)
+                for term in self.torque
+            )
+            lengths = np.linalg.norm(s, axis=1)
+            torques = np.linalg.norm(np.cross(s, np.reshape(w, (-1, 3))), axis=1)
+            turning_rates = turning_rates + torques / np.where(lengths > 0.0, lengths, 1.0)
+        turning_rate = float(turning_rates.max())
         diffusion = 0.0
-        if boltzmann and parts is not None and parts.heating is not None:
-            temperature = np.asarray(parts.heating.bath_values_at_sites(gradient[n:]))
-            diffusion = float((2.0 * boltzmann * np.abs(temperature) * rate).max())
+        if boltzmann and parts is not None:
+            T = self._noise_temperatures(parts, gradient, temperature)
+            diffusion = float((2.0 * boltzmann * np.abs(T) * rate).max())
         if not (turning_rate > 0.0 or diffusion > 0.0):
             raise InputError("no spin turns at this state, so any step will do. Give a state away from rest")
         return min(angle / turning_rate if turning_rate else np.inf, angle**2 / diffusion if diffusion else np.inf)
+
+    def _noise_temperatures(self, parts: _DampingParts, gradient, temperature) -> np.ndarray:
+        """Return the temperatures of the noise, of all spins or of each; InputError if they are missing or doubled."""
+        if parts.heating is None:
+            if temperature is None:
+                raise InputError(
+                    "the system has no baths, so the temperature of the noise is not known. Give temperature=, as to "
+                    "lt.Fluctuations"
+                )
+            positive_condition("the temperature").require(checked_numbers(temperature, "the temperature", ()))
+            return np.asarray(temperature, dtype=float)
+        if temperature is not None:
+            raise InputError("temperature= is for systems without baths; here the baths have the temperatures")
+        return np.asarray(parts.heating.bath_values_at_sites(gradient[self.body_dim :]))
 
     def state_array(self, x, batch: bool = False):
         """Return x as a checked flat state; x may be the spins alone, shape ``(*sites, 3)``."""
@@ -251,7 +284,9 @@ class SpinSystem(TorqueSystem):
 
     def spins(self, x) -> jax.Array:
         """Return the spins, shape ``(..., *sites, 3)``, of states, shape (..., n)."""
-        x = jnp.asarray(x)
+        x = checked_numbers(x, "states")
+        if x.shape[-1:] not in ((self.dim,), (self.body_dim,)):
+            raise InputError(f"states must have shape (..., {self.dim}), got {x.shape}")
         return x[..., : self.body_dim].reshape(*x.shape[:-1], *self.lattice, 3)
 
     def casimirs(self) -> dict[str, Energy]:

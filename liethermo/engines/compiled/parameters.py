@@ -40,7 +40,7 @@ class ProgramStructure:
         leaves, structure = jax.tree_util.tree_flatten(dynamic)
         static_leaves, static_structure = jax.tree_util.tree_flatten(static)
         return ProgramStructure(
-            (static_structure, tuple(static_leaves)),
+            (structure, static_structure, tuple(static_leaves)),
             tuple(np.shape(leaf) for leaf in leaves),
             lambda arrays: eqx.combine(jax.tree_util.tree_unflatten(structure, arrays), static),
         )

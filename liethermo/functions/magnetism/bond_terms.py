@@ -89,13 +89,23 @@ def crystal_exchange(lattice_or_bonds: Lattice | Bonds, strength) -> Energy:
     if isinstance(strength, Mapping):
         if not strength:
             raise InputError("a mapping from shells to exchange constants must not be empty")
-        return Sum.from_terms([_scalar_exchange(lattice_or_bonds.shell(number), J) for number, J in strength.items()])
+        shells = [lattice_or_bonds.shell(number) for number in strength]
+        _check_pairs_of_shells(lattice_or_bonds, shells)
+        return Sum.from_terms([_scalar_exchange(shell, J) for shell, J in zip(shells, strength.values(), strict=True)])
     if isinstance(strength, list | tuple):
         if not strength:
             raise InputError("a list of exchange constants, one for each shell, must not be empty")
-        shells = lattice_or_bonds.shells(len(strength))
+        shells = list(lattice_or_bonds.shells(len(strength)))
+        _check_pairs_of_shells(lattice_or_bonds, shells)
         return Sum.from_terms([_scalar_exchange(shell, J) for shell, J in zip(shells, strength, strict=True)])
     return _scalar_exchange(lattice_or_bonds.shell(1), strength)
+
+
+def _check_pairs_of_shells(lattice: Lattice, shells: list[Bonds]) -> None:
+    """Raise InputError if bonds of two shells join one pair on a short periodic axis, unless images count."""
+    parts = [(shell.first, shell.second, shell.offsets) for shell in shells]
+    first, second, offsets = (np.concatenate(values) for values in zip(*parts, strict=True))
+    Bonds(lattice, first, second, offsets).check_pairs()
 
 
 def _scalar_exchange(bonds: Bonds, strength) -> Energy:

@@ -12,6 +12,7 @@ import numpy as np
 from manifolds._class_members import ListedType
 
 from ...errors import InputError
+from ..conditions import checked_host_numbers
 
 SHELL_TOLERANCE = 1e-6
 """Relative difference of distances below which two neighbours belong to one shell.
@@ -86,7 +87,7 @@ def lattice(
         or the vectors of a cell (length), d = 1, 2 or 3.
     cells : int or tuple of int
         Number of cells along each vector; one integer for all vectors.
-    constant : float
+    constant : float > 0
         Lattice constant a (length), by which vectors and basis are multiplied. In a honeycomb or kagome lattice a is
         the length of a cell vector, not the distance of neighbours.
     periodic : bool or tuple of bool
@@ -96,7 +97,7 @@ def lattice(
     primitive : bool
         Use the primitive cell of "bcc", "fcc", "diamond" or "pyrochlore" (1, 1, 2 and 4 atoms), not the conventional
         cubic cell (2, 4, 8 and 16 atoms).
-    c_over_a : float
+    c_over_a : float > 0
         Ratio of the two lattice constants of "hcp".
     images : bool
         Count bonds to the periodic images of a spin as bonds of their own. By default bonds that join a pair twice, or
@@ -124,9 +125,13 @@ def lattice(
         vectors, positions = _vectors_and_basis_of_crystal(crystal, primitive, c_over_a)
     else:
         vectors, positions = crystal, _ORIGIN if basis is None else basis
-    vectors, positions = (np.array(value, dtype=float) * float(constant) for value in (vectors, positions))
+    scale = _checked_length(constant, "the constant of a lattice")
+    vectors, positions = (
+        scale * checked_host_numbers(value, name)
+        for value, name in ((vectors, "the vectors of a lattice"), (positions, "the basis of a lattice"))
+    )
     if not (np.isfinite(vectors).all() and np.isfinite(positions).all()):
-        raise InputError("vectors, basis and constant of a lattice must be finite numbers")
+        raise InputError("vectors and basis of a lattice must be finite numbers")
     if vectors.ndim != 2 or vectors.shape[1] != 3 or not 1 <= len(vectors) <= 3:
         raise InputError(f"the vectors of a lattice must have shape (1, 3), (2, 3) or (3, 3), got {vectors.shape}")
     if np.linalg.matrix_rank(vectors) < len(vectors):
@@ -137,8 +142,11 @@ def lattice(
     cell_counts = _axis_values(cells, axes, "cells")
     if any(isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1 for n in cell_counts):
         raise InputError(f"cells must be positive integers, one for each of the {axes} axes, got {cells!r}")
-    periodic_axes = tuple(bool(p) for p in _axis_values(periodic, axes, "periodic"))
-    result = Lattice(vectors, positions, tuple(map(int, cell_counts)), periodic_axes, bool(images))
+    for value, name in ((primitive, "primitive"), (images, "images")):
+        _check_truth_values((value,), name)
+    periodic_axes = _axis_values(periodic, axes, "periodic")
+    _check_truth_values(periodic_axes, "periodic")
+    result = Lattice(vectors, positions, tuple(map(int, cell_counts)), tuple(map(bool, periodic_axes)), bool(images))
     result.check_basis()
     return result
 
@@ -146,6 +154,7 @@ def lattice(
 def _vectors_and_basis_of_crystal(name: str, primitive: bool, c_over_a: float) -> tuple:
     """Return the cell vectors and basis positions of a named crystal, in units of the lattice constant."""
     if name == "hcp":
+        c_over_a = _checked_length(c_over_a, "c_over_a")
         return (*_TRIANGLE, (0.0, 0.0, c_over_a)), (
             (0.0, 0.0, 0.0),
             (0.5, 0.5 / _SQRT3, 0.5 * c_over_a),
@@ -154,6 +163,20 @@ def _vectors_and_basis_of_crystal(name: str, primitive: bool, c_over_a: float) -
         names = ", ".join(map(repr, sorted([*CRYSTALS, "hcp"])))
         raise InputError(f"no crystal {name!r}. The names are {names}; or give vectors and a basis")
     return PRIMITIVE_CELLS.get(name, CRYSTALS[name]) if primitive else CRYSTALS[name]
+
+
+def _checked_length(value, name: str) -> float:
+    """Return a number; raise InputError unless it is one positive and finite number."""
+    number = checked_host_numbers(value, name)
+    if number.shape or not 0.0 < number < np.inf:
+        raise InputError(f"{name} must be one positive and finite number, got {value!r}")
+    return float(number)
+
+
+def _check_truth_values(values, name: str) -> None:
+    """Raise InputError unless all values are True or False; a text such as "no" would count as True."""
+    if not all(isinstance(value, bool | np.bool_) for value in values):
+        raise InputError(f"{name} must be True or False, got {', '.join(map(repr, values))}")
 
 
 def _axis_values(value, n_axes: int, quantity_name: str) -> tuple:
@@ -244,12 +267,14 @@ class Lattice(metaclass=ListedType):
         InputError
         """
         axes, rows = len(self.cells), []
+        if isinstance(pairs, str) or not np.iterable(pairs):
+            raise InputError(f"pairs must be a sequence of bonds (a, b, offset), or of offsets, got {pairs!r}")
         for pair in pairs:
             a, b, offset = pair if _has_atom_indices(pair) else (0, 0, pair)
             offset = tuple(np.atleast_1d(offset).tolist())
-            if len(offset) != axes or any(int(o) != o for o in offset):
+            if len(offset) != axes or not all(_is_integral(o) for o in offset):
                 raise InputError(f"the offset of a bond must have {axes} integers, got {offset}")
-            if not (0 <= a < len(self.basis) and 0 <= b < len(self.basis)):
+            if not all(_is_integral(atom) and 0 <= atom < len(self.basis) for atom in (a, b)):
                 raise InputError(f"a bond must join two of the {len(self.basis)} atoms of a cell, got {a} and {b}")
             row = (int(a), int(b), *map(int, offset))
             if row in rows or _reversed_bond_row(row) in rows:
@@ -261,6 +286,7 @@ class Lattice(metaclass=ListedType):
 
     def neighbours(self, distance: float) -> Bonds:
         """Return all bonds up to a distance (length)."""
+        distance = _checked_length(distance, "the distance of neighbours")
         rows = self._bond_rows_within(float(distance) * (1.0 + SHELL_TOLERANCE))
         if not rows:
             raise InputError(f"no two sites of the lattice are at a distance of at most {distance:g}")
@@ -313,6 +339,11 @@ def _nearest_shells(lattice: Lattice, count: int) -> tuple[Bonds, ...]:
         if len(groups) >= count:
             return tuple(bonds.subset(np.sort(group)) for group in groups[:count])
         distance *= 1.5
+
+
+def _is_integral(value) -> bool:
+    """Return whether a value is a real number that is an integer."""
+    return isinstance(value, int | float | np.integer | np.floating) and float(value).is_integer()
 
 
 def _has_atom_indices(pair) -> bool:

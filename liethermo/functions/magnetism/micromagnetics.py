@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...errors import InputError
-from ..conditions import checked_numbers
+from ..conditions import checked_host_numbers, checked_numbers
 from ..energy import Energy
 from .bond_terms import crystal_antisymmetric_exchange, crystal_exchange
 from .dipoles import FourierKernel, padded_length, pair_interaction_energy
@@ -46,7 +46,8 @@ def mesh(cells, size, periodic=False) -> Lattice:
     >>> film.sites, film.positions[0, 0, 0].tolist()
     ((100, 25, 1), [2.5e-09, 2.5e-09, 1.5e-09])
     """
-    edges = np.broadcast_to(np.asarray(size, dtype=float), (3,)) if np.shape(size) in ((), (3,)) else np.zeros(3)
+    edges = checked_host_numbers(size, "the edges of a mesh")
+    edges = np.broadcast_to(edges, (3,)) if edges.shape in ((), (3,)) else np.zeros(3)
     if not (edges > 0.0).all() or np.ndim(cells) != 1 or len(cells) != 3:
         raise InputError(
             f"a mesh must have three numbers of cells and one or three positive edges, got {cells}, {size}"

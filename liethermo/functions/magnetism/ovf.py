@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from ...disk import checked_path
 from ...errors import FileError, InputError
+from ..conditions import checked_host_numbers
 
 CHECK_VALUES = {4: 1234567.0, 8: 123456789012345.0}
 """First number of binary data, by its bytes, which shows the order of the bytes."""
@@ -77,14 +79,21 @@ def read_ovf(path) -> VectorField:
         origin = float(header["xbase"]), float(header["ybase"]), float(header["zbase"])
         dim = int(header["valuedim"]) if version == 2 else 3
         factor = float(header.get("valuemultiplier", 1.0)) if version == 1 else 1.0
-    except (KeyError, ValueError) as error:
-        raise FileError(f"{path} has no valid header: the entry {error} is missing or is not a number") from error
+    except KeyError as error:
+        raise FileError(f"{path} has no valid header: the entry {error} is missing") from error
+    except ValueError as error:
+        raise FileError(f"{path} has no valid header: {error}") from error
     if min(*nodes, dim) < 1:
         raise FileError(f"{path} must have positive numbers of cells and components, got {nodes} and {dim}")
-    count = int(np.prod(nodes)) * dim
+    if not (min(size) > 0.0 and np.isfinite((*size, *origin, factor)).all()):
+        raise FileError(
+            f"{path} must have positive edges of cells and finite numbers in its header, got the edges {size}, the "
+            f"origin {origin} and the multiplier {factor:g}"
+        )
+    count = math.prod(nodes) * dim
     data = _read_data(content, start, kind, version, count, path)
     values = factor * data.reshape(*nodes[::-1], dim).transpose(2, 1, 0, 3)
-    unit = header.get("valueunits", "").split(" ")[0] if version == 2 else header.get("valueunit", "")
+    unit = _first_list_entry(header.get("valueunits", "")) if version == 2 else header.get("valueunit", "")
     title, length_unit = header.get("title", ""), header.get("meshunit", "m")
     return VectorField(np.ascontiguousarray(values), size, origin, title, unit, length_unit)
 
@@ -122,20 +131,32 @@ def write_ovf(
     ------
     InputError, FileError
     """
-    array = np.asarray(values, dtype=float)
-    edges = np.broadcast_to(np.asarray(size, dtype=float), (3,)) if np.shape(size) in ((), (3,)) else np.zeros(3)
-    if array.ndim != 4 or (version == 1 and array.shape[3] != 3):
-        raise InputError(f"values of an OVF file must have shape (nx, ny, nz, 3), got {array.shape}")
-    if not (edges > 0.0).all():
-        raise InputError(f"size must be one or three positive edges of a cell, got {size}")
+    array = checked_host_numbers(values, "values of an OVF file")
+    edges = checked_host_numbers(size, "size")
+    edges = np.broadcast_to(edges, (3,)) if edges.shape in ((), (3,)) else np.zeros(3)
     if version not in (1, 2):
         raise InputError(f"version must be 1 or 2, got {version!r}")
+    if array.ndim != 4 or not array.size or (version == 1 and array.shape[3] != 3):
+        components = "3" if version == 1 else "components"
+        raise InputError(
+            f"values of an OVF file of version {version} must have shape (nx, ny, nz, {components}), got {array.shape}"
+        )
+    if not ((edges > 0.0) & (edges < np.inf)).all():
+        raise InputError(f"size must be one or three positive and finite edges of a cell, got {size}")
     kinds = {"text": "Text", "binary 4": "Binary 4", "binary 8": "Binary 8"}
     if representation not in kinds:
         raise InputError(f'representation must be "text", "binary 4" or "binary 8", got {representation!r}')
-    base = edges / 2.0 if origin is None else np.asarray(origin, dtype=float)
-    if any("\n" in text for text in (title, unit)):
-        raise InputError("title and unit must be single lines")
+    base = edges / 2.0 if origin is None else checked_host_numbers(origin, "origin")
+    if base.shape != (3,) or not np.isfinite(base).all():
+        raise InputError(f"origin must be three finite numbers, got {origin}")
+    for name, text in (("title", title), ("unit", unit)):
+        if not isinstance(text, str) or "##" in text or len(text.splitlines()) > 1 or text != text.strip():
+            raise InputError(
+                f"{name} must be a single line without '##', which begins a comment, and without spaces at its ends, "
+                f"got {text!r}"
+            )
+    if "{" in unit or "}" in unit:
+        raise InputError(f"unit must not have braces, got {unit!r}")
     lines = _header_lines(array, edges, base, version, title, unit)
     kind = kinds[representation]
     flat = array.transpose(2, 1, 0, 3).reshape(-1, array.shape[3])
@@ -144,6 +165,8 @@ def write_ovf(
     else:
         width = int(kind[-1])
         dtype = np.dtype(f"{'<' if version == 2 else '>'}f{width}")
+        if np.abs(flat[np.isfinite(flat)]).max(initial=0.0) > np.finfo(dtype).max:
+            raise InputError(f'values must be at most {np.finfo(dtype).max:.3g} in 4 bytes. Use "binary 8"')
         body = np.concatenate([[CHECK_VALUES[width]], flat.ravel()]).astype(dtype).tobytes() + b"\n"
     head = "".join(f"# {line}\n" for line in [*lines, f"Begin: Data {kind}"])
     tail = f"# End: Data {kind}\n# End: Segment\n"
@@ -166,12 +189,28 @@ def _header_lines(array: np.ndarray, edges, base, version: int, title: str, unit
         lines += [f"{axis}nodes: {n}", f"{axis}stepsize: {e:.17g}"]
     if version == 2:
         labels = " ".join(f"m_{axis}" for axis in ("xyz" if dim == 3 else map(str, range(dim))))
-        lines += [f"valuedim: {dim}", f"valuelabels: {labels}", "valueunits: " + " ".join([unit or "1"] * dim)]
+        lines += [
+            f"valuedim: {dim}",
+            f"valuelabels: {labels}",
+            "valueunits: " + " ".join([_list_entry(unit or "1")] * dim),
+        ]
     else:
         lengths = np.linalg.norm(array, axis=-1)
         lines += [f"valueunit: {unit or 1}", "valuemultiplier: 1"]
         lines += [f"ValueRangeMinMag: {lengths.min():.17g}", f"ValueRangeMaxMag: {lengths.max():.17g}"]
     return [*lines, "End: Header"]
+
+
+def _list_entry(text: str) -> str:
+    """Return a text as an entry of a Tcl list, in braces if it has spaces."""
+    return f"{{{text}}}" if " " in text else text
+
+
+def _first_list_entry(text: str) -> str:
+    """Return the first entry of a Tcl list, without its braces."""
+    if text.startswith("{") and "}" in text:
+        return text[1 : text.index("}")]
+    return text.split(" ")[0]
 
 
 def _parse_header(content: bytes, path: Path) -> tuple[int, dict[str, str], str, int]:
@@ -181,7 +220,7 @@ def _parse_header(content: bytes, path: Path) -> tuple[int, dict[str, str], str,
     while position < min(len(content), HEADER_BYTES):
         end = content.find(b"\n", position)
         end = len(content) if end < 0 else end
-        line = content[position:end].decode("latin-1").strip()
+        line = _decode_line(content[position:end]).strip()
         position = end + 1
         if not version:
             version = _version_of_line(line, path)
@@ -193,6 +232,14 @@ def _parse_header(content: bytes, path: Path) -> tuple[int, dict[str, str], str,
             return version, header, " ".join(value.lower().split()[1:]), position
         header.setdefault(key, value.strip())
     raise FileError(f"{path} has no data: the line '# Begin: Data' is missing")
+
+
+def _decode_line(line: bytes) -> str:
+    """Return a line of a header as text, from UTF-8, or from Latin-1 if it is no UTF-8."""
+    try:
+        return line.decode("utf-8")
+    except UnicodeDecodeError:
+        return line.decode("latin-1")
 
 
 def _version_of_line(line: str, path: Path) -> int:
@@ -216,13 +263,20 @@ def _read_data(content: bytes, data_start: int, data_kind: str, version: int, n_
         except ValueError as error:
             raise FileError(f"{path} has data that are not numbers: {error}") from error
         if len(numbers) != n_numbers:
-            raise FileError(f"{path} must have {n_numbers} numbers, got {len(numbers)}. The file is not complete")
+            cause = "The file is not complete" if len(numbers) < n_numbers else "Its header does not fit its data"
+            raise FileError(f"{path} must have {n_numbers} numbers, got {len(numbers)}. {cause}")
         return numbers
     if data_kind not in ("binary 4", "binary 8"):
         raise FileError(f"{path} has data of the kind {data_kind!r}. Text, binary 4 and binary 8 are read")
     width = int(data_kind[-1])
     if len(content) < data_start + width * (n_numbers + 1):
         raise FileError(f"{path} is not complete: it must have {n_numbers} numbers of {width} bytes")
+    following_text = content[data_start + width * (n_numbers + 1) :].lstrip()
+    if following_text and not following_text.startswith(b"#"):
+        raise FileError(
+            f"{path} has more data than the {n_numbers} numbers of {width} bytes of its header. Its header does "
+            "not fit its data"
+        )
     for order in "<>" if version == 2 else "><":
         numbers = np.frombuffer(content, dtype=np.dtype(f"{order}f{width}"), count=n_numbers + 1, offset=data_start)
         if numbers[0] == CHECK_VALUES[width]:

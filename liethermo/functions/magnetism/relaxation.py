@@ -12,9 +12,10 @@ import numpy as np
 from manifolds._precision import with_library_settings
 
 from ...errors import ConvergenceError, InputError
-from ..conditions import checked_numbers
-from ..energy import Energy, Sum, make_energy
+from ..conditions import checked_numbers, require_condition
+from ..energy import Energy, Sum
 from .site_terms import zeeman
+from .spin_energy import check_finite, checked_site_values, energy_of_spins
 
 MAX_ROTATION = 0.3
 """Largest angle (radian) by which a spin turns in a step, so that a descent stays in its valley."""
@@ -61,9 +62,9 @@ def minimise(energy, spins, tolerance: float = 1e-8, max_steps: int = 100_000) -
         The energy of the spins.
     spins : array, shape ``(*sites, 3)``
         The start; its lengths are kept.
-    tolerance : float
+    tolerance : float > 0
         The descent ends when no torque ``|s x grad H|`` exceeds this fraction of the largest gradient.
-    max_steps : int
+    max_steps : int > 0
         Largest number of steps.
 
     Returns
@@ -72,7 +73,7 @@ def minimise(energy, spins, tolerance: float = 1e-8, max_steps: int = 100_000) -
 
     Raises
     ------
-    InputError
+    InputError, FunctionError
     ConvergenceError
         If the torque is not small after ``max_steps`` steps.
 
@@ -82,19 +83,36 @@ def minimise(energy, spins, tolerance: float = 1e-8, max_steps: int = 100_000) -
     >>> round(lt.magnetism.minimise(energy, [[1.0, 0.0, 0.0]]).energy, 9)
     -2.0
     """
+    start = _checked_start(spins)
+    _check_stopping_criteria(tolerance, max_steps)
+    return _minimise_checked(energy_of_spins(energy, start.shape[:-1]), start, tolerance, max_steps)
+
+
+def _checked_start(spins) -> jax.Array:
+    """Return spins of shape ``(*sites, 3)``; raise InputError unless they are finite and no spin is zero."""
     start = checked_numbers(spins, "spins")
     if start.ndim < 2 or start.shape[-1] != 3 or not bool(jnp.isfinite(start).all()):
         raise InputError(f"spins must be finite numbers of shape (*sites, 3), got {start.shape}")
-    lengths = jnp.linalg.norm(start, axis=-1, keepdims=True)
-    if not bool((lengths > 0.0).all()):
+    if not bool((jnp.linalg.norm(start, axis=-1) > 0.0).all()):
         raise InputError("every spin must have a length greater than 0")
-    if isinstance(energy, Energy | list):
-        function, is_flat = make_energy(energy, "the energy"), True
-    else:
-        function, is_flat = make_energy(energy, "the energy"), False
-    result = _descend_to_minimum(
-        function, is_flat, start / lengths, lengths, jnp.asarray(tolerance), jnp.asarray(max_steps)
+    return start
+
+
+def _check_stopping_criteria(tolerance, max_steps) -> None:
+    """Raise InputError unless the tolerance and the number of steps are positive and finite."""
+    require_condition(
+        checked_numbers(tolerance, "the tolerance", ()),
+        lambda a: (a > 0.0) & (a < np.inf),
+        "the tolerance must be positive and finite, got {value}",
     )
+    if isinstance(max_steps, bool) or not isinstance(max_steps, int | np.integer) or max_steps < 1:
+        raise InputError(f"max_steps must be a positive integer, got {max_steps!r}")
+
+
+def _minimise_checked(energy: Energy, start: jax.Array, tolerance: float, max_steps: int) -> Minimum:
+    """Return the minimum of an energy of flat states next to checked spins."""
+    lengths = jnp.linalg.norm(start, axis=-1, keepdims=True)
+    result = _descend_to_minimum(energy, start / lengths, lengths, jnp.asarray(tolerance), jnp.asarray(max_steps))
     unit_vectors, value, torque, steps = jax.device_get(result)
     if not torque <= tolerance:
         raise ConvergenceError(
@@ -117,13 +135,12 @@ class _DescentState(NamedTuple):
 
 
 @eqx.filter_jit
-def _descend_to_minimum(energy: Energy, is_flat: bool, unit_vectors, lengths, tolerance, max_steps):
+def _descend_to_minimum(energy: Energy, unit_vectors, lengths, tolerance, max_steps):
     """Return the unit vectors, energy and relative torque of a minimum, and the number of steps that found it."""
 
     def value_and_slope(unit_vectors):
-        s = unit_vectors * lengths
-        x = s.reshape(-1) if is_flat else s
-        gradient = lengths * (energy.gradient(x) if is_flat else jax.grad(energy.value)(x)).reshape(unit_vectors.shape)
+        x = (unit_vectors * lengths).reshape(-1)
+        gradient = lengths * energy.gradient(x).reshape(unit_vectors.shape)
         slope = gradient - jnp.sum(gradient * unit_vectors, axis=-1, keepdims=True) * unit_vectors
         torque = jnp.max(jnp.linalg.norm(slope, axis=-1))
         scale = jnp.max(jnp.linalg.norm(gradient, axis=-1))
@@ -185,6 +202,7 @@ class HysteresisLoop(NamedTuple):
     energies: np.ndarray
 
 
+@with_library_settings
 def hysteresis_loop(
     energy,
     spins,
@@ -199,20 +217,20 @@ def hysteresis_loop(
 
     Parameters
     ----------
-    energy : Energy or list of energies
-        Of the spins without the field.
+    energy : Energy, list of energies, or function from the spins, shape ``(*sites, 3)``, to a scalar
+        The energy of the spins without the field.
     spins : array, shape ``(*sites, 3)``
-        The start.
+        The start; its lengths are kept.
     fields : array, shape (n, 3)
         Fields in their order, such as ``np.linspace(1, -1, 41)[:, None] * [0, 0, 1]``.
     moment : float, or array of the shape of the sites
         Moments in the Zeeman energy.
     tolerance, max_steps
         See :func:`minimise`.
-    perturbation : float
+    perturbation : float >= 0
         Size of random rotations (radian) before each descent. Without them a spin exactly opposite to its field stays
         there, although the state is unstable.
-    seed : int
+    seed : int >= 0
         Seed of the rotations.
 
     Returns
@@ -221,23 +239,33 @@ def hysteresis_loop(
 
     Raises
     ------
-    InputError, ConvergenceError
+    InputError, FunctionError, ConvergenceError
     """
-    terms = make_energy(energy, "the energy")
-    state = np.asarray(checked_numbers(spins, "spins"))
-    values = np.asarray(checked_numbers(fields, "fields"))
+    state = np.asarray(_checked_start(spins))
+    sites = state.shape[:-1]
+    terms = energy_of_spins(energy, sites).terms
+    values = np.asarray(check_finite(checked_numbers(fields, "fields"), "fields"))
     if values.ndim != 2 or values.shape[1] != 3 or not len(values):
         raise InputError(f"fields must have shape (n, 3), got {values.shape}")
+    _check_stopping_criteria(tolerance, max_steps)
+    angle = checked_numbers(perturbation, "the perturbation", ())
+    require_condition(
+        angle, lambda a: (a >= 0.0) & (a < np.inf), "the perturbation must be >= 0 and finite, got {value}"
+    )
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise InputError(f"the seed must be an integer >= 0, got {seed!r}")
     random = np.random.default_rng(seed)
-    weights = np.broadcast_to(np.asarray(moment, dtype=float), state.shape[:-1])
-    weights = weights / weights.mean()
+    moments = np.asarray(checked_site_values(moment, sites, (), "a moment"))
+    if not moments.mean() > 0.0:
+        raise InputError(f"the mean of the moments must be positive, got {moments.mean():g}")
+    weights = np.broadcast_to(moments / moments.mean(), sites)
     minima = []
     for field in values:
         lengths = np.linalg.norm(state, axis=-1, keepdims=True)
-        state = state + perturbation * lengths * random.standard_normal(state.shape)
+        state = state + float(angle) * lengths * random.standard_normal(state.shape)
         state = state * lengths / np.linalg.norm(state, axis=-1, keepdims=True)
-        total = Sum((*terms.terms, zeeman(state.shape[:-1], field, moment)))
-        minimum = minimise(total, state, tolerance, max_steps)
+        total = Sum((*terms, zeeman(sites, field, moments)))
+        minimum = _minimise_checked(total, jnp.asarray(state), tolerance, max_steps)
         state = np.asarray(minimum.spins)
         minima.append(minimum)
     loop_spins = np.stack([minimum.spins for minimum in minima])

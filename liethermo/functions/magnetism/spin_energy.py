@@ -22,8 +22,10 @@ from manifolds.structures.spins import (
 )
 
 from ...errors import InputError
+from ..checks import checked_energy
 from ..conditions import checked_numbers
-from ..energy import Energy
+from ..energy import Energy, make_energy
+from ..flat_states import functions_of_flat_states
 from .lattices import Lattice
 
 
@@ -108,6 +110,28 @@ def flattened_spins(x, sites: tuple[int, ...]) -> jax.Array:
     if x.shape[-len(shape) :] != shape:
         raise InputError(f"spins must have shape (..., {', '.join(map(str, shape))}) or (..., {n}), got {x.shape}")
     return x.reshape(*x.shape[: -len(shape)], n)
+
+
+def energy_of_spins(energy, sites: tuple[int, ...]) -> Energy:
+    """Return an energy of spins as a checked energy of flat states.
+
+    Parameters
+    ----------
+    energy : Energy, function from the spins, shape ``(*sites, 3)``, to a scalar, or list of them
+    sites : tuple of int
+
+    Raises
+    ------
+    InputError, FunctionError
+        If the energy depends on time, or does not map spins of this shape to one real number.
+    """
+    function = make_energy(energy, "the energy")
+    if function.depends_on_time:
+        raise InputError(
+            "the energy must be a function of the spins alone, but it depends on time. Give it at one time t: "
+            "energy.at_time(t) in place of an Energy, lambda s: f(s, t) in place of a function f"
+        )
+    return checked_energy(functions_of_flat_states(function, (*sites, 3)), 3 * math.prod(sites), "the energy")
 
 
 def check_spin_count(sites: tuple[int, ...], dim: int, role: str) -> None:

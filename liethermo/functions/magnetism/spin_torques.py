@@ -16,9 +16,10 @@ from manifolds.structures.spins import cross
 from ...errors import FunctionError, IndexOutOfRangeError, InputError
 from ...tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ...tracing.traced import trace_callables_and_result_shapes
-from ..conditions import checked_numbers, require_condition
+from ..conditions import checked_numbers, nonnegative_condition, positive_condition
 from ..time_span import required_argument_count
 from .lattices import Lattice
+from .spin_energy import check_finite
 
 
 class Slonczewski(Module):
@@ -29,9 +30,13 @@ class Slonczewski(Module):
     Parameters
     ----------
     polarisation : array, shape (3,) or ``(*sites, 3)``
-        p, a unit vector.
+        p, a unit vector, which is not normalised.
     damping_like, field_like : float, array of the shape of the sites, or function of the time
         a and b (1 / time), beside Landau and Lifshitz' form. The damping-like torque turns spins towards p if a < 0.
+
+    Raises
+    ------
+    InputError
     """
 
     polarisation: jax.Array
@@ -39,7 +44,7 @@ class Slonczewski(Module):
     field_like: jax.Array | Callable
 
     def __init__(self, polarisation, damping_like=0.0, field_like=0.0):
-        self.polarisation = checked_numbers(polarisation, "a polarisation")
+        self.polarisation = check_finite(checked_numbers(polarisation, "a polarisation"), "a polarisation")
         if self.polarisation.shape[-1:] != (3,):
             raise InputError(f"a polarisation must have shape (3,) or (*sites, 3), got {self.polarisation.shape}")
         self.damping_like = _checked_amplitude(damping_like)
@@ -61,10 +66,18 @@ class SpinOrbit(Slonczewski):
         Amplitudes (1 / time) of ``s x (s x p)`` and of ``s x p``, as of :class:`Slonczewski`.
     normal : array, shape (3,)
         Normal of the interface, from the heavy metal to the magnet.
+
+    Raises
+    ------
+    InputError
     """
 
     def __init__(self, current, damping_like=0.0, field_like=0.0, normal=(0.0, 0.0, 1.0)):
-        p = np.cross(np.asarray(normal, dtype=float), np.asarray(current, dtype=float))
+        n, j = (
+            np.asarray(check_finite(checked_numbers(value, name, (3,)), name))
+            for value, name in ((normal, "the normal"), (current, "the current"))
+        )
+        p = np.cross(n, j)
         length = np.linalg.norm(p)
         if not length > 0.0:
             raise InputError("the current of a spin-orbit torque must not be parallel to the normal")
@@ -96,6 +109,7 @@ class ZhangLi(Module):
 
     velocity: jax.Array
     beta: jax.Array
+    cells: tuple[int, ...] = eqx.field(static=True)
     edges: tuple[float, ...] = eqx.field(static=True)
     periodic: tuple[bool, ...] = eqx.field(static=True)
 
@@ -105,13 +119,20 @@ class ZhangLi(Module):
         self.edges = tuple(float(edge) for edge in np.diag(cells.vectors))
         if not np.array_equal(cells.vectors, np.diag(self.edges)):
             raise InputError("cells must be rectangular, as those of lt.magnetism.mesh")
-        self.periodic = cells.periodic
-        u = checked_numbers(velocity, "a velocity", (3,))
-        b, a = checked_numbers(beta, "beta", ()), checked_numbers(alpha, "alpha", ())
+        self.cells, self.periodic = cells.cells, cells.periodic
+        u = check_finite(checked_numbers(velocity, "a velocity", (3,)), "a velocity")
+        b, a = (
+            check_finite(checked_numbers(value, name, ()), name) for value, name in ((beta, "beta"), (alpha, "alpha"))
+        )
         self.velocity = u * (1.0 + a * b) / (1.0 + a**2)
         self.beta = (b - a) / (1.0 + a * b)
 
     def __call__(self, t, s):
+        if s.shape != (*self.cells, 3):
+            raise InputError(
+                f"the current of this torque flows in a mesh of {self.cells} cells, so spins must have shape "
+                f"{(*self.cells, 3)}, got {s.shape}"
+            )
         derivative = jnp.zeros_like(s)
         for axis, (edge, is_periodic) in enumerate(zip(self.edges, self.periodic, strict=True)):
             if s.shape[axis] > 1:
@@ -132,7 +153,8 @@ def _central_difference(s, axis: int, spacing: float, is_periodic: bool) -> jax.
 
 def _checked_amplitude(value):
     """Return the amplitude of a torque: a function of the time unchanged, or checked numbers."""
-    return value if callable(value) else checked_numbers(value, "the amplitude of a torque")
+    name = "the amplitude of a torque"
+    return value if callable(value) else check_finite(checked_numbers(value, name), name)
 
 
 def _evaluate_amplitude(value, t) -> jax.Array:
@@ -212,9 +234,9 @@ class LaserPulse(Module):
     def __init__(self, energy, duration, centre=0.0):
         self.energy = checked_numbers(energy, "the energy of a pulse", ())
         self.duration = checked_numbers(duration, "the duration of a pulse", ())
-        self.centre = checked_numbers(centre, "the centre of a pulse", ())
-        require_condition(self.energy, lambda e: e >= 0.0, "the energy of a pulse must be >= 0, got {value:g}")
-        require_condition(self.duration, lambda w: w > 0.0, "the duration of a pulse must be positive, got {value:g}")
+        self.centre = check_finite(checked_numbers(centre, "the centre of a pulse", ()), "the centre of a pulse")
+        nonnegative_condition("the energy of a pulse").require(self.energy)
+        positive_condition("the duration of a pulse").require(self.duration)
 
     def __call__(self, t) -> jax.Array:
         height = self.energy * math.sqrt(GAUSSIAN_EXPONENT / math.pi) / self.duration

@@ -14,9 +14,9 @@ from manifolds._precision import with_library_settings
 
 from ...errors import InputError
 from ..conditions import checked_numbers
-from ..energy import Energy, make_energy
+from ..energy import Energy
 from .lattices import Lattice
-from .spin_energy import lattice_shape
+from .spin_energy import check_finite, energy_of_spins, lattice_shape
 
 REST_TOLERANCE = 1e-5
 """Largest torque of a state of rest, relative to the largest gradient."""
@@ -34,8 +34,8 @@ def spin_wave_frequencies(
 
     Parameters
     ----------
-    energy : Energy or list of energies
-        Of the spins of a periodic lattice.
+    energy : Energy, list of energies, or function from the spins, shape ``(*sites, 3)``, to a scalar
+        The energy of the spins of a periodic lattice.
     lattice : Lattice
         The lattice of the sites.
     spins : array, shape ``(*sites, 3)``
@@ -55,7 +55,7 @@ def spin_wave_frequencies(
 
     Raises
     ------
-    InputError
+    InputError, FunctionError
         If the state is not at rest, or does not repeat.
 
     Examples
@@ -68,14 +68,17 @@ def spin_wave_frequencies(
     ... ).round(6).tolist()
     [[2.0]]
     """
-    function = make_energy(energy, "the energy")
-    s = np.asarray(checked_numbers(spins, "spins", (*lattice.sites, 3)))
-    q = np.asarray(checked_numbers(wave_vectors, "wave vectors"))
+    if not isinstance(lattice, Lattice):
+        raise InputError(f"lattice must be one of lt.magnetism.lattice, got {type(lattice).__name__}")
+    function = energy_of_spins(energy, lattice.sites)
+    s = np.asarray(check_finite(checked_numbers(spins, "spins", (*lattice.sites, 3)), "spins"))
+    if not np.linalg.norm(s, axis=-1).all():
+        raise InputError("every spin must have a length greater than 0")
+    q = np.asarray(check_finite(checked_numbers(wave_vectors, "wave vectors"), "wave vectors"))
     if q.shape[-1:] != (3,):
         raise InputError(f"wave vectors must have shape (..., 3), got {q.shape}")
-    repeat = (1,) * len(lattice.cells) if magnetic_cell is None else tuple(magnetic_cell)
-    if len(repeat) != len(lattice.cells) or any(n % m for n, m in zip(lattice.cells, repeat, strict=True)):
-        raise InputError(f"magnetic_cell must divide the cells {lattice.cells}, got {repeat}")
+    gamma = float(check_finite(checked_numbers(ratio, "ratio", ()), "ratio"))
+    repeat = _checked_magnetic_cell(magnetic_cell, lattice)
     _check_spins_repeat(s, lattice, repeat)
     gradient = np.asarray(function.gradient(s.ravel())).reshape(-1, 3)
     flat_spins = s.reshape(-1, 3)
@@ -94,7 +97,7 @@ def spin_wave_frequencies(
     for k, i in enumerate(members):  # a spin moves on a sphere, whose curvature adds the slope along the spin
         rows[2 * k : 2 * k + 2, i] -= radial_slopes[k] * np.eye(2)
     positions = offsets @ lattice.vectors
-    rotation = np.kron(np.diag(ratio * lengths), [[0.0, -1.0], [1.0, 0.0]])
+    rotation = np.kron(np.diag(gamma * lengths), [[0.0, -1.0], [1.0, 0.0]])
     frequencies = []
     for wave in q.reshape(-1, 3):
         phases = np.exp(1j * positions @ wave)
@@ -104,11 +107,31 @@ def spin_wave_frequencies(
     return np.stack(frequencies).reshape(*q.shape[:-1], count)
 
 
+def _checked_magnetic_cell(magnetic_cell, lattice: Lattice) -> tuple[int, ...]:
+    """Return the numbers of cells of a magnetic cell; raise InputError unless they divide those of the lattice."""
+    if magnetic_cell is None:
+        return (1,) * len(lattice.cells)
+    values: list = np.atleast_1d(np.asarray(magnetic_cell, dtype=object)).ravel().tolist()
+    is_valid = len(values) == len(lattice.cells) and all(
+        isinstance(m, int) and not isinstance(m, bool) and m > 0 and n % m == 0
+        for n, m in zip(lattice.cells, values, strict=True)
+    )
+    if not is_valid:
+        raise InputError(
+            f"magnetic_cell must be positive integers that divide the cells {lattice.cells}, one for each axis, got "
+            f"{magnetic_cell!r}"
+        )
+    return tuple(values)
+
+
 def _positive_frequencies(eigenvalues: np.ndarray, n_frequencies: int) -> np.ndarray:
-    """Return the ``n_frequencies`` largest eigenvalues, in ascending order; NaN for one that is not real."""
+    """Return the ``n_frequencies`` largest real eigenvalues, in ascending order, with NaN in place of complex pairs."""
     scale = max(np.abs(eigenvalues).max(), 1e-300)
-    real = np.where(np.abs(eigenvalues.imag) <= IMAGINARY_TOLERANCE * scale, eigenvalues.real, np.nan)
-    upper = np.sort(real)[-n_frequencies:] if np.isnan(real).any() else np.sort(real)[n_frequencies:]
+    is_real = np.abs(eigenvalues.imag) <= IMAGINARY_TOLERANCE * scale
+    # two eigenvalues belong to a spin, and complex ones are pairs
+    n_real = max(n_frequencies - int(np.count_nonzero(~is_real)) // 2, 0)
+    real = np.sort(eigenvalues.real[is_real])
+    upper = np.concatenate([real[len(real) - n_real :], np.full(n_frequencies - n_real, np.nan)])
     return np.where(np.abs(upper) <= IMAGINARY_TOLERANCE * scale, np.abs(upper), upper)
 
 
@@ -195,7 +218,7 @@ def spin_temperature(energy, spins, sites) -> float:
 
     Parameters
     ----------
-    energy : Energy or list of energies
+    energy : Energy, list of energies, or function from the spins, shape ``(*sites, 3)``, to a scalar
         The energy of the spins.
     spins : array, shape ``(..., *sites, 3)``
         One state, or samples of equilibrium, over which numerator and denominator are averaged.
@@ -208,13 +231,17 @@ def spin_temperature(energy, spins, sites) -> float:
 
     Raises
     ------
-    InputError
-        If the shape is wrong, or the Laplacian is not positive, as in states of negative temperature.
+    InputError, FunctionError
+        If the shape is wrong, a spin is zero or not finite, or the Laplacian is not positive, as in states of negative
+        temperature.
     """
-    function, shape = make_energy(energy, "the energy"), (*lattice_shape(sites), 3)
-    s = np.asarray(checked_numbers(spins, "spins"))
-    if s.shape[-len(shape) :] != shape:
+    site_shape = lattice_shape(sites)
+    function, shape = energy_of_spins(energy, site_shape), (*site_shape, 3)
+    s = np.asarray(check_finite(checked_numbers(spins, "spins"), "spins"))
+    if s.shape[-len(shape) :] != shape or not s.size:
         raise InputError(f"spins must have shape (..., {', '.join(map(str, shape))}), got {s.shape}")
+    if not np.linalg.norm(s, axis=-1).all():
+        raise InputError("every spin must have a length greater than 0")
     samples = jnp.asarray(s.reshape(-1, math.prod(shape)))
     count = samples.shape[1] // 3
     probes = (

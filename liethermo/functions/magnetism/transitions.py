@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ...errors import InputError
+from ..conditions import checked_numbers, positive_condition
+from .spin_energy import check_finite
 
 AUTOCORRELATION_WINDOW = 6.0
 """Window of an integrated autocorrelation time, in units of this time [Sokal 1997]."""
@@ -109,10 +111,19 @@ def cumulant_crossing(a: MagnetSamples, b: MagnetSamples) -> Estimate:
     ------
     InputError
     """
+    for samples in (a, b):
+        if not isinstance(samples, MagnetSamples):
+            raise InputError(f"samples must be lt.magnetism.MagnetSamples, got {type(samples).__name__}")
+        positive_condition("the temperature of samples").require(
+            checked_numbers(samples.temperature, "the temperature of samples", ())
+        )
     if a.temperature != b.temperature:
         raise InputError(f"both lattices must have the same temperature, got {a.temperature:g} and {b.temperature:g}")
     squares = [_checked_squared_magnetisation(samples.magnetisation) for samples in (a, b)]
-    energies = [np.asarray(samples.energy, dtype=float) for samples in (a, b)]
+    energies = [
+        np.asarray(check_finite(checked_numbers(samples.energy, "the energies of samples"), "the energies of samples"))
+        for samples in (a, b)
+    ]
     for square, energy in zip(squares, energies, strict=True):
         if energy.shape != square.shape:
             raise InputError(f"energies of {len(square)} samples must have shape ({len(square)},), got {energy.shape}")
@@ -149,11 +160,13 @@ def autocorrelation_time(values) -> float:
 
 def _checked_squared_magnetisation(magnetisation) -> np.ndarray:
     """Return ``m^2`` of each sample, shape (n,); raise InputError unless the samples have shape (n, 3)."""
-    m = np.asarray(magnetisation, dtype=float)
+    m = np.asarray(checked_numbers(magnetisation, "a magnetisation"))
     if m.ndim != 2 or m.shape[1] != 3 or len(m) < MIN_BLOCKS or not np.isfinite(m).all():
         raise InputError(
             f"a magnetisation must be finite numbers of shape (n, 3) with n >= {MIN_BLOCKS}, got shape {m.shape}"
         )
+    if not m.any():
+        raise InputError("a magnetisation must not be zero in every sample")
     return (m**2).sum(axis=1)
 
 

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import scipy.constants
 
 from ...errors import InputError
-from ..conditions import checked_numbers, require_condition
+from ..conditions import checked_numbers, nonnegative_condition, positive_condition
+from .spin_energy import check_finite
 
 ELECTRON_G_FACTOR = -scipy.constants.physical_constants["electron g factor"][0]
 """g of a free electron, 2.00232."""
@@ -72,9 +73,10 @@ class Units(NamedTuple):
     hbar: float
     dipole_constant: float
 
-    def gamma(self, g: float = ELECTRON_G_FACTOR) -> float:
+    def gamma(self, g=ELECTRON_G_FACTOR):
         """Return the gyromagnetic ratio ``g mu_B / hbar`` (radian / (time * field)), of a spin with the factor g."""
-        return g * self.bohr_magneton / self.hbar
+        factor = g if isinstance(g, int | float) else checked_numbers(g, "the factor g")
+        return factor * self.bohr_magneton / self.hbar
 
     def moment(self, magnetons=1.0):
         """Return a magnetic moment (energy / field), given in Bohr ``magnetons``."""
@@ -127,14 +129,15 @@ class Units(NamedTuple):
     def _gyromagnetic_ratio(self, moment, g: float):
         """Return ``gamma / mu`` for spins of this moment, by default one Bohr magneton."""
         mu = self.moment() if moment is None else checked_numbers(moment, "a moment")
-        require_condition(mu, lambda m: m > 0.0, "a moment must be positive, got {value}")
-        return self.gamma(g) / mu
+        positive_condition("a moment").require(mu)
+        factor = check_finite(checked_numbers(g, "the factor g"), "the factor g")
+        return self.gamma(factor) / mu
 
 
 def _checked_damping(alpha):
     """Return a damping constant; raise InputError if it is negative."""
     alpha = checked_numbers(alpha, "alpha")
-    require_condition(alpha, lambda a: a >= 0.0, "alpha must be >= 0, got {value}")
+    nonnegative_condition("alpha").require(alpha)
     return alpha
 
 

@@ -8,7 +8,9 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.engines.compiled.llvm_writer import ProgramWriter
+from liethermo.engines.compiled.parameters import ProgramStructure
 from liethermo.engines.select_engine import CompiledEngineWarning
+from liethermo.functions.magnetism.site_terms import QuadraticSiteEnergy
 from liethermo.runs import problem
 from liethermo.tracing import scalarize
 from liethermo.tracing.builder import ProgramBuilder
@@ -122,3 +124,27 @@ def test_the_primitive_and_the_line_of_a_fault_are_named(monkeypatch):
     with pytest.raises(scalarize.CompilerFault, match=r"on the JAX primitive 'sin' \(test_faults.py:\d+") as error_info:
         scalarize.scalarize(jax.make_jaxpr(sine)(X0))
     assert isinstance(error_info.value.__cause__, ZeroDivisionError)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 0, 2)])
+def test_systems_with_other_optional_parameters_have_other_programs(order, fresh_programs):
+    """Systems of one class run after one another; each has one array of shape (3,), of another parameter.
+
+    An easy axis, a field, and both in one term, so that a program that served another system would move these spins.
+    """
+    axis = lt.magnetism.anisotropy(2, 1.5)
+    field = lt.magnetism.zeeman(2, (0.0, 0.0, 1.0))  # its zeros are those of the axis
+    systems = [lt.SpinSystem(2, energy, lt.LandauLifshitz(0.1)) for energy in (axis, field, [axis, field])]
+    start = np.array([[0.6, 0.0, 0.8], [0.0, 0.8, -0.6]])
+    for i in order:
+        runs = [lt.integrate(systems[i], start, (0.0, 1.0), 0.1, engine=e) for e in ("compiled", "array")]
+        np.testing.assert_allclose(runs[0].x, runs[1].x, atol=1e-14)
+
+
+def test_the_key_of_a_program_knows_which_parameters_exist():
+    vector = jnp.array([0.0, 0.0, 1.0])
+    linear, quadratic = QuadraticSiteEnergy((1,), None, vector, None), QuadraticSiteEnergy((1,), vector, None, None)
+    assert ProgramStructure.from_module(linear) != ProgramStructure.from_module(quadratic)
+    assert ProgramStructure.from_module(linear) == ProgramStructure.from_module(
+        QuadraticSiteEnergy((1,), None, 2.0 * vector, None)
+    )

@@ -238,3 +238,13 @@ def test_bad_input(arguments, message):
     default = {"system": rigid_body(), "x0s": np.array([0.1, 1.0, 0.1]), "t_span": (0.0, 1.0), "step": 0.1}
     with pytest.raises(lt.InputError, match=message):
         lt.ensemble(**(default | arguments))
+
+
+def test_save_every_asks_for_trajectories():
+    starts = np.array([[0.1, 0.2, 1.0], [0.3, -0.2, 0.5]])
+    many = lt.ensemble(lt.models.rigid_body(rate=0.2), starts, (0.0, 1.0), 0.1, save_every=5)
+    single = lt.integrate(lt.models.rigid_body(rate=0.2), starts[1], (0.0, 1.0), 0.1, save_every=5)
+    np.testing.assert_allclose(many.x[1], single.x, atol=1e-15)
+    assert many.x.shape == (2, 3, 3)
+    with pytest.raises(lt.InputError, match="save_at"):
+        lt.ensemble(lt.models.rigid_body(), starts, (0.0, 1.0), lt.Adaptive(1e-6), save_every=5)

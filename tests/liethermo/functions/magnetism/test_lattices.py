@@ -138,3 +138,47 @@ BAD = {
 
 
 test_bad_lattices_are_refused = refusal_test(BAD, error=lt.LiethermoError)
+
+
+def test_bonds_of_two_shells_that_join_one_pair_are_refused():
+    """On a ring of three atoms the second neighbour is the first one of the other direction."""
+    ring = mag.lattice("chain", 3)
+    for strength in ([1.0, 0.5], {1: 1.0, 2: 0.5}):
+        with pytest.raises(lt.LiethermoError, match="a pair of spins twice"):
+            mag.exchange(ring, strength)
+        with_images = mag.lattice("chain", 3, images=True)
+        assert float(mag.exchange(with_images, strength)(np.tile([0.0, 0.0, 1.0], 3))) == -4.5
+        assert float(mag.exchange(mag.lattice("chain", 5), strength)(np.tile([0.0, 0.0, 1.0], 5))) == -7.5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"periodic": "no"}, "periodic must be True or False"),
+        ({"periodic": (True, None, False)}, "periodic must be True or False"),
+        ({"images": "no"}, "images must be True or False"),
+        ({"primitive": 1}, "primitive must be True or False"),
+        ({"constant": -1.0}, "the constant of a lattice must be one positive"),
+        ({"constant": "x"}, "the constant of a lattice must be made of real numbers"),
+        ({"constant": [1.0, 2.0, 3.0]}, "the constant of a lattice must be one positive"),
+        ({"crystal": "hcp", "c_over_a": -1.0}, "c_over_a must be one positive"),
+        ({"crystal": 1j}, "the vectors of a lattice must be made of real numbers"),
+        ({"crystal": np.eye(3), "basis": "x"}, "the basis of a lattice must be made of real numbers"),
+    ],
+)
+def test_wrong_kinds_of_arguments_are_refused(arguments, message):
+    with pytest.raises(lt.InputError, match=message):
+        mag.lattice(**{"crystal": "fcc", "cells": 3} | arguments)
+    assert mag.lattice("fcc", 3, periodic=np.array([True, False, True])).periodic == (True, False, True)
+
+
+def test_bad_bonds_are_refused():
+    crystal = mag.lattice("sc", 3)
+    for pairs in (3, None, "abc", [(np.nan, 0, 1)], [(0.5, 0, 1)], [(0, 0.5, (1, 0, 0))], [("0", 0, (1, 0, 0))]):
+        with pytest.raises(lt.InputError, match="bond"):
+            crystal.bonds(pairs)
+    for distance in (-1.0, np.inf, np.nan, "x", [1.0]):
+        with pytest.raises(lt.InputError, match="the distance of neighbours"):
+            crystal.neighbours(distance)
+    with pytest.raises(lt.InputError, match="the edges of a mesh must be made of real numbers"):
+        mag.mesh((2, 2, 2), "x")

@@ -206,3 +206,46 @@ def CHAIN():
 
 
 test_bad_measurements_are_refused = refusal_test(BAD, error=lt.LiethermoError)
+
+
+def test_an_unstable_spin_does_not_hide_the_frequency_of_a_stable_one():
+    """Two spins without coupling are at a minimum, with the frequency 2 K, and at a saddle."""
+    crystal = mag.lattice([(2.0, 0.0, 0.0)], 4, basis=[(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)])
+    of_first, of_second = np.array([1.0, 0.0]) * np.ones((4, 1)), np.array([0.0, 1.0]) * np.ones((4, 1))
+    energy = [
+        mag.anisotropy(crystal, 1.5 * of_first),
+        mag.anisotropy(crystal, of_second, (1.0, 0.0, 0.0)),
+        mag.anisotropy(crystal, -of_second, (0.0, 1.0, 0.0)),
+    ]
+    frequencies = mag.spin_wave_frequencies(energy, crystal, up(crystal), [(0.3, 0.0, 0.0)])
+    np.testing.assert_allclose(frequencies, [[3.0, np.nan]], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"lattice": 8}, r"lattice must be one of lt\.magnetism\.lattice"),
+        ({"ratio": np.ones(8)}, "ratio must be one number"),
+        ({"ratio": np.nan}, "ratio must be finite"),
+        ({"wave_vectors": [(np.nan, 0.0, 0.0)]}, "wave vectors must be finite"),
+        ({"magnetic_cell": 3}, "magnetic_cell must be positive integers"),
+        ({"magnetic_cell": (0,)}, "magnetic_cell must be positive integers"),
+        ({"magnetic_cell": "x"}, "magnetic_cell must be positive integers"),
+        ({"spins": np.zeros((8, 3))}, "length greater than 0"),
+    ],
+)
+def test_bad_arguments_of_waves_are_refused(arguments, message):
+    crystal = mag.lattice("chain", 8)
+    good = {"energy": mag.exchange(crystal, 1.0), "lattice": crystal, "spins": up(crystal)}
+    good |= {"wave_vectors": [(1.0, 0.0, 0.0)]}
+    mag.spin_wave_frequencies(**good, magnetic_cell=2)
+    with pytest.raises(lt.InputError, match=message):
+        mag.spin_wave_frequencies(**good | arguments)
+
+
+def test_wave_vectors_and_spins_of_a_structure_factor_are_finite():
+    crystal = mag.lattice("chain", 8)
+    with pytest.raises(lt.InputError, match="wave vectors must be finite"):
+        mag.structure_factor(up(crystal), crystal, [(np.nan, 0.0, 0.0)])
+    with pytest.raises(lt.InputError, match="spins must be finite"):
+        mag.structure_factor(np.nan * up(crystal), crystal)

@@ -145,3 +145,49 @@ def test_damaged_files_are_refused(tmp_path):
         mag.write_ovf(path, VALUES, 1e-9, "binary 16")
     with pytest.raises(lt.LiethermoError, match="shape"):
         mag.write_ovf(path, VALUES[0], 1e-9)
+
+
+@pytest.mark.parametrize("representation", ["text", "binary 4", "binary 8"])
+def test_a_header_that_does_not_fit_its_data_is_refused(representation, tmp_path):
+    path = tmp_path / "field.ovf"
+    mag.write_ovf(path, VALUES, 1e-9, representation)
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"valuedim: 3", b"valuedim: 2"))
+    with pytest.raises(lt.LiethermoError, match="Its header does not fit its data"):
+        mag.read_ovf(path)
+    for key in (b"xstepsize: ", b"ybase: "):
+        for value in (b"nan\n# x: ", b"0\n# x: " if key == b"xstepsize: " else b"inf\n# x: "):
+            path.write_bytes(content.replace(key, key + value))
+            with pytest.raises(lt.LiethermoError, match="positive edges of cells and finite numbers"):
+                mag.read_ovf(path)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_titles_and_units_come_back(version, tmp_path):
+    path = tmp_path / "field.ovf"
+    for title, unit in (("µMAG 4: m / M, # 1", "A / m"), ("m", "µT"), ("", "1")):
+        mag.write_ovf(path, VALUES, 1e-9, "binary 8", version, title, unit)
+        field = mag.read_ovf(path)
+        assert (field.title, field.unit) == (title, unit)
+    path.write_bytes(path.read_bytes().replace(b"Title: ", b"Title: \xb5MAG"))  # Latin-1
+    assert mag.read_ovf(path).title == "µMAG"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"values": "x"}, "must be made of real numbers"),
+        ({"values": 1j * VALUES}, "must be made of real numbers"),
+        ({"values": VALUES[:, :0]}, "must have shape"),
+        ({"values": 1e300 * np.ones((1, 1, 1, 3)), "representation": "binary 4"}, 'Use "binary 8"'),
+        ({"size": np.inf}, "positive and finite edges"),
+        ({"origin": (0.0, 1.0)}, "three finite numbers"),
+        ({"origin": (0.0, np.nan, 1.0)}, "three finite numbers"),
+        ({"title": "a ## b"}, "begins a comment"),
+        ({"title": 3}, "title must be a single line"),
+        ({"unit": "{T}"}, "braces"),
+    ],
+)
+def test_what_a_file_cannot_hold_is_refused(arguments, message, tmp_path):
+    with pytest.raises(lt.InputError, match=message):
+        mag.write_ovf(tmp_path / "field.ovf", **{"values": VALUES, "size": 1e-9} | arguments)

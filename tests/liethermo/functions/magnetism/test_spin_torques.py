@@ -70,3 +70,65 @@ def test_bad_torques_are_refused():
         mag.SpinOrbit((0.0, 0.0, 1.0), 1.0)
     with pytest.raises(lt.LiethermoError, match=r"lt\.magnetism\.mesh"):
         mag.ZhangLi(mag.lattice("bcc", 3), (1.0, 0.0, 0.0))
+
+
+def test_the_largest_step_holds_for_torques_and_for_noise_without_baths():
+    s = np.array([[0.6, 0.0, 0.8]])
+    torque = mag.Slonczewski((1.0, 0.0, 0.0), -100.0, lambda t: 30.0 * t)
+    system = lt.SpinSystem(1, mag.zeeman(1, (0.0, 0.0, 0.5)), lt.LandauLifshitz(0.1), torque=torque)
+    w = -100.0 * np.cross(s, [1.0, 0.0, 0.0]) + 60.0 * np.array([1.0, 0.0, 0.0])
+    rate = np.hypot(1.0, 0.1) * 0.5 + np.linalg.norm(np.cross(s, w))
+    assert system.largest_step(s, 0.2, t=2.0) == pytest.approx(0.2 / rate, rel=1e-13)
+    at_rest = lt.SpinSystem(1, mag.zeeman(1, (0.0, 0.0, 0.5)), torque=torque)
+    assert at_rest.largest_step([[0.0, 0.0, 1.0]], 0.2) == pytest.approx(0.2 / (0.5 + 100.0), rel=1e-13)
+    by_noise = system.largest_step(s, 0.01, boltzmann=3.0, temperature=500.0)
+    assert by_noise == pytest.approx(1e-4 / (2.0 * 3.0 * 500.0 * 0.1), rel=1e-13)
+    with pytest.raises(lt.InputError, match="Give temperature="):
+        system.largest_step(s, boltzmann=3.0)
+    warm = lt.SpinSystem(1, mag.zeeman(1, (0.0, 0.0, 0.5)), lt.LandauLifshitz(0.1), lt.HeatBaths())
+    with pytest.raises(lt.InputError, match="the baths have the temperatures"):
+        warm.largest_step(s, boltzmann=3.0, temperature=2.0)
+    for arguments in ({"angle": -1.0}, {"angle": np.nan}, {"boltzmann": -1.0}, {"boltzmann": "x"}, {"t": np.nan}):
+        with pytest.raises(lt.InputError, match=f"{next(iter(arguments)) if 't' not in arguments else 'time'} must be"):
+            system.largest_step(s, **arguments)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda bad: mag.Slonczewski((1.0, 0.0, 0.0), bad),
+        lambda bad: mag.Slonczewski((1.0, bad, 0.0)),
+        lambda bad: mag.SpinOrbit((1.0, bad, 0.0)),
+        lambda bad: mag.SpinOrbit((1.0, 0.0, 0.0), normal=(0.0, 0.0, bad)),
+        lambda bad: mag.ZhangLi(mag.mesh((2, 1, 1), 1.0), (1.0, 0.0, bad)),
+        lambda bad: mag.ZhangLi(mag.mesh((2, 1, 1), 1.0), (1.0, 0.0, 0.0), bad),
+        lambda bad: mag.LaserPulse(bad, 1.0),
+        lambda bad: mag.LaserPulse(1.0, bad),
+        lambda bad: mag.LaserPulse(1.0, 1.0, bad),
+        lambda bad: lt.SpinSystem(2, mag.zeeman(2, (0.0, 0.0, 1.0)), ratio=bad),
+        lambda bad: lt.LandauLifshitz.gilbert(bad),
+        lambda bad: mag.units("meV").gilbert(0.1, 1.0, bad),
+    ],
+)
+def test_amplitudes_are_finite(make):
+    make(0.5)
+    for bad in (np.nan, np.inf, "x", 1j):
+        with pytest.raises(lt.InputError, match=r"must be (one |positive |>= 0 |made of |finite)|, got|must be finite"):
+            make(bad)
+
+
+def test_the_parameters_of_a_reversed_precession():
+    """The advice of the message: Gilbert's damping lowers the energy for alpha and ratio of one sign."""
+    with pytest.raises(lt.InputError, match="give alpha < 0"):
+        lt.LandauLifshitz.gilbert(0.1, -2.0)
+    ratio, rate = lt.LandauLifshitz.gilbert(-0.1, -2.0)
+    s, g = np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.3, -1.0])
+    v = float(ratio) * np.cross(s, g) + float(rate) * np.cross(s, np.cross(s, g))
+    np.testing.assert_allclose(v, -2.0 * np.cross(s, g) - 0.1 * np.cross(s, v), atol=1e-15)
+    assert g @ v < 0.0
+
+
+def test_a_current_flows_in_its_own_mesh():
+    torque = mag.ZhangLi(mag.mesh((2, 2, 3), 1.0), (1.0, 0.0, 0.0))
+    with pytest.raises(lt.FunctionError, match=r"mesh of \(2, 2, 3\) cells"):
+        lt.SpinSystem((3, 2, 2), mag.zeeman((3, 2, 2), (0.0, 0.0, 1.0)), torque=torque)

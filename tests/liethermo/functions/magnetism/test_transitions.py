@@ -105,3 +105,19 @@ def test_crystals_lose_their_order_at_the_temperature_of_the_literature(name, li
     crossing = mag.cumulant_crossing(*samples)
     assert crossing.error < 0.01 * literature  # the fcc run measures 0.84 %
     assert abs(crossing.value - literature) < 0.01 * literature
+
+
+def test_wrong_kinds_of_samples_are_refused():
+    m = np.random.default_rng(0).standard_normal((20, 3))
+    for bad, message in (("x", "real numbers"), (1j * m, "real numbers"), (0.0 * m, "zero in every sample")):
+        with pytest.raises(lt.InputError, match=message):
+            mag.binder_cumulant(bad)
+    good = mag.MagnetSamples(1.0, np.arange(20.0), m)
+    for a, message in (
+        (3, "MagnetSamples"),
+        (good._replace(temperature=-1.0), "temperature of samples must be positive"),
+        (good._replace(temperature=np.inf), "temperature of samples must be positive"),
+        (good._replace(energy=np.full(20, np.nan)), "energies of samples must be finite"),
+    ):
+        with pytest.raises(lt.InputError, match=message):
+            mag.cumulant_crossing(a, a)
