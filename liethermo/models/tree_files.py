@@ -97,10 +97,10 @@ def read_urdf(source: str | os.PathLike, fixed_base: bool = False) -> list[BodyR
     _refuse_unknown_children(robot, "robot", {"link", "joint"}, URDF_SHAPES | {"transmission"})
     links: dict[str, Element] = {}
     for link in robot.findall("link"):
-        name = _required_attribute(link, "name")
-        if name in links:
-            raise InputError(f"two links have the name {name!r}")
-        links[name] = link
+        link_name = _required_attribute(link, "name")
+        if link_name in links:
+            raise InputError(f"two links have the name {link_name!r}")
+        links[link_name] = link
     joint_of: dict[str, Element] = {}
     for joint in robot.findall("joint"):
         kind, name = _required_attribute(joint, "type"), _required_attribute(joint, "name")
@@ -110,9 +110,9 @@ def read_urdf(source: str | os.PathLike, fixed_base: bool = False) -> list[BodyR
                 f"{', '.join(URDF_JOINTS)}"
             )
         parent, child = (_required_attribute(_required_only_child(joint, tag), "link") for tag in ("parent", "child"))
-        for link in (parent, child):
-            if link not in links:
-                raise InputError(f"the joint {name!r} names the link {link!r}, which the file does not have")
+        for link_name in (parent, child):
+            if link_name not in links:
+                raise InputError(f"the joint {name!r} names the link {link_name!r}, which the file does not have")
         if child in joint_of:
             raise InputError(f"the link {child!r} has two parents: a loop of joints is not a tree")
         joint_of[child] = joint
