@@ -288,8 +288,9 @@ class Tree(metaclass=ListedType):
 
         If no body of the ``worldbody`` has a free joint, the base is the ground, with the name ``world``. Masses and
         inertias are those of ``inertial`` elements. ``damping``, ``stiffness``, ``springref`` and ``armature="0"`` of a
-        joint are covered; limits of position and force do not act. The gravity of the file is not taken over: give
-        ``gravity=`` to :meth:`system`.
+        joint are covered; limits of position and force, and contacts, do not act. Springs, damping and ``armature`` of
+        a free joint are refused. The gravity of the file and the pose of a free base are not taken over: give
+        ``gravity=`` to :meth:`system`, and ``attitude=`` to :func:`.integrate`.
 
         Parameters
         ----------

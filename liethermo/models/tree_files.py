@@ -95,7 +95,12 @@ def read_urdf(source: str | os.PathLike, fixed_base: bool = False) -> list[BodyR
     """
     robot = _read_xml_root(source, "robot", "URDF")
     _refuse_unknown_children(robot, "robot", {"link", "joint"}, URDF_SHAPES | {"transmission"})
-    links = {_required_attribute(link, "name"): link for link in robot.findall("link")}
+    links: dict[str, Element] = {}
+    for link in robot.findall("link"):
+        link_name = _required_attribute(link, "name")
+        if link_name in links:
+            raise InputError(f"two links have the name {link_name!r}")
+        links[link_name] = link
     joint_of: dict[str, Element] = {}
     for joint in robot.findall("joint"):
         kind, name = _required_attribute(joint, "type"), _required_attribute(joint, "name")
@@ -105,9 +110,9 @@ def read_urdf(source: str | os.PathLike, fixed_base: bool = False) -> list[BodyR
                 f"{', '.join(URDF_JOINTS)}"
             )
         parent, child = (_required_attribute(_required_only_child(joint, tag), "link") for tag in ("parent", "child"))
-        for link in (parent, child):
-            if link not in links:
-                raise InputError(f"the joint {name!r} names the link {link!r}, which the file does not have")
+        for link_name in (parent, child):
+            if link_name not in links:
+                raise InputError(f"the joint {name!r} names the link {link_name!r}, which the file does not have")
         if child in joint_of:
             raise InputError(f"the link {child!r} has two parents: a loop of joints is not a tree")
         joint_of[child] = joint
@@ -140,7 +145,7 @@ URDF_JOINTS = ("revolute", "continuous", "prismatic", "fixed")
 def _read_urdf_link(name: str, link: Element, joint: Element | None) -> LinkRecord:
     _refuse_unknown_children(link, f"link {name!r}", {"inertial"}, URDF_SHAPES)
     mass, centre, inertia = 0.0, np.zeros(3), np.zeros((3, 3))
-    if (inertial := link.find("inertial")) is not None:
+    if (inertial := _optional_only_child(link, "inertial")) is not None:
         _refuse_unknown_children(inertial, f"inertial of {name!r}", {"origin", "mass", "inertia"}, set())
         mass = _number_attribute(_required_only_child(inertial, "mass"), "value")
         entries = {
@@ -157,12 +162,13 @@ def _read_urdf_link(name: str, link: Element, joint: Element | None) -> LinkReco
     rotation, origin = _read_urdf_origin(joint)
     joints: tuple[JointRecord, ...] = ()
     if kind != "fixed":
-        axis, dynamics = joint.find("axis"), joint.find("dynamics")
+        axis, dynamics = _optional_only_child(joint, "axis"), _optional_only_child(joint, "dynamics")
         direction = np.array([1.0, 0.0, 0.0]) if axis is None else _number_array_attribute(axis, "xyz", 3)
         damping = 0.0
         if dynamics is not None:
             damping = _number_attribute(dynamics, "damping", 0.0)
-            _refuse_nonzero_attribute(dynamics, "friction", f"dynamics of the joint {joint_name!r}")
+            for attribute in sorted(set(dynamics.attrib) - {"damping"}):
+                _refuse_nonzero_attribute(dynamics, attribute, f"dynamics of the joint {joint_name!r}")
         joints = (JointRecord(kind == "prismatic", np.zeros(3), direction, 0.0, damping, 0.0),)
     parent = _required_attribute(_required_only_child(joint, "parent"), "link")
     return LinkRecord(name, parent, rotation, origin, mass, centre, inertia, joints)
@@ -170,9 +176,10 @@ def _read_urdf_link(name: str, link: Element, joint: Element | None) -> LinkReco
 
 def _read_urdf_origin(element: Element) -> tuple[np.ndarray, np.ndarray]:
     """Read the ``origin`` of a URDF element; return the rotation, shape (3, 3), and the position, shape (3,)."""
-    origin = element.find("origin")
+    origin = _optional_only_child(element, "origin")
     if origin is None:
         return np.eye(3), np.zeros(3)
+    _refuse_unknown_attributes(origin, f"the origin in {_element_text(element)}", {"xyz", "rpy"})
     angles = _number_array_attribute(origin, "rpy", 3, np.zeros(3))
     return Rotation.from_euler("xyz", angles).as_matrix(), _number_array_attribute(origin, "xyz", 3, np.zeros(3))
 
@@ -192,6 +199,10 @@ def read_mjcf(source: str | os.PathLike) -> tuple[list[BodyRecord], bool]:
     for option in root.findall("option"):
         for name in ("density", "viscosity", "wind"):
             _refuse_nonzero_attribute(option, name, "option")
+        for flag in option.findall("flag"):
+            for name in ("spring", "damper"):
+                if flag.get(name, "enable") != "enable":
+                    raise InputError(f"{name}={flag.get(name)!r} of flag is not covered")
     reader = _MjcfReader(root)
     world = _required_only_child(root, "worldbody")
     _refuse_unknown_children(world, "worldbody", {"body"}, MJCF_SHAPES)
@@ -233,6 +244,9 @@ MJCF_JOINT_ATTRIBUTES = {
 }  # fmt: skip
 """Attributes of a joint of MJCF that are covered, or that do not act without limits and actuators."""
 
+MJCF_FREE_JOINT_LOADS = ("stiffness", "damping", "armature", "frictionloss", "springdamper")
+"""Attributes of a free joint of MJCF that act on the motion of the base; its other attributes do not."""
+
 MJCF_ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 """Attributes of MJCF that orient a frame."""
 
@@ -247,14 +261,16 @@ class _MjcfReader:
             for name, value in compiler.attrib.items():
                 if name not in MJCF_COMPILER_IGNORED and MJCF_COMPILER_DEFAULTS.get(name) != value:
                     raise InputError(f"{name}={value!r} of the compiler is not covered")
-            angle = compiler.get("angle", "degree")
-            if angle not in ("degree", "radian"):
-                raise InputError(f"angle of the compiler must be degree or radian, got {angle!r}")
-            self.angle_unit = 1.0 if angle == "radian" else np.pi / 180.0
+            if (angle := compiler.get("angle")) is not None:  # one compiler element does not undo another one
+                if angle not in ("degree", "radian"):
+                    raise InputError(f"angle of the compiler must be degree or radian, got {angle!r}")
+                self.angle_unit = 1.0 if angle == "radian" else np.pi / 180.0
             if compiler.get("inertiafromgeom", "auto") == "true":
                 raise InputError("inertiafromgeom='true' is not covered. Give each body an inertial element")
         for default in root.findall("default"):
             _refuse_unknown_children(default, "default", {"joint"}, MJCF_SHAPES | {"mesh", "material", "pair"})
+            if default.get("class", "main") != "main":
+                raise InputError(f"class={default.get('class')!r} of default is not covered")
             for joint in default.findall("joint"):
                 self.joint_defaults |= joint.attrib
 
@@ -262,9 +278,11 @@ class _MjcfReader:
         """Append a body, and recursively the bodies in it, to the records."""
         name = body.get("name") or f"body {len(self.records) + 1}"
         _refuse_unknown_children(body, f"body {name!r}", {"inertial", "joint", "freejoint", "body"}, MJCF_SHAPES)
-        for attribute in ("childclass", "mocap", "gravcomp"):
-            if body.get(attribute) not in (None, "false", "0"):
-                raise InputError(f"{attribute} of the body {name!r} is not covered")
+        covered = {"name", "pos", "mocap", "gravcomp", "user", "sleep", *MJCF_ORIENTATIONS}
+        _refuse_unknown_attributes(body, f"the body {name!r}", covered)
+        if body.get("mocap", "false") != "false":
+            raise InputError(f"mocap of the body {name!r} is not covered")
+        _refuse_nonzero_attribute(body, "gravcomp", f"the body {name!r}")
         joints = body.findall("joint")
         is_free = _has_free_joint(body)
         if is_free != (parent is None) or (is_free and len(joints) + len(body.findall("freejoint")) != 1):
@@ -272,7 +290,9 @@ class _MjcfReader:
                 f"the body {name!r} must have no free joint, which belongs to the base" if is_free
                 else f"the body {name!r} is the base, which needs a freejoint and no other joint"
             )  # fmt: skip
-        inertial = body.find("inertial")
+        if is_free:
+            self._check_free_joint(body, name)
+        inertial = _optional_only_child(body, "inertial")
         if inertial is None:
             raise InputError(f"the body {name!r} needs an inertial element, since inertias of shapes are not computed")
         R, centre = self._read_frame(inertial)
@@ -284,6 +304,21 @@ class _MjcfReader:
         for child in body.findall("body"):
             self.add_body(child, name)
 
+    def _check_free_joint(self, body: Element, name: str) -> None:
+        """Raise InputError if the free joint of a body has springs, dampers or an attribute that is not covered."""
+        text = f"the free joint of {name!r}"
+        if (freejoint := body.find("freejoint")) is not None:  # the defaults of joints do not act on it
+            _refuse_unknown_attributes(freejoint, text, {"name", "group", "align"})
+            if freejoint.get("align") == "true":
+                raise InputError(f"align='true' of {text} is not covered, because it turns the axes of the base")
+            return
+        joint = Element("joint", self.joint_defaults | body.findall("joint")[0].attrib)
+        for attribute in MJCF_FREE_JOINT_LOADS:
+            _refuse_nonzero_attribute(joint, attribute, text)
+        _refuse_unknown_attributes(joint, text, MJCF_JOINT_ATTRIBUTES | {*MJCF_FREE_JOINT_LOADS, "ref", "align"})
+        if joint.get("align") == "true":
+            raise InputError(f"align='true' of {text} is not covered, because it turns the axes of the base")
+
     def _read_joint(self, joint: Element, body: str) -> JointRecord:
         attributes = self.joint_defaults | joint.attrib
         joint = Element("joint", attributes)
@@ -294,9 +329,8 @@ class _MjcfReader:
             )
         for attribute in ("armature", "frictionloss", "springdamper", "ref"):
             _refuse_nonzero_attribute(joint, attribute, joint_text)
-        ignored = MJCF_JOINT_ATTRIBUTES | {"armature", "frictionloss", "springdamper", "ref"}
-        if unknown := sorted(set(attributes) - ignored):
-            raise InputError(f"the attribute {unknown[0]!r} of {joint_text} is not covered")
+        covered = MJCF_JOINT_ATTRIBUTES | {"armature", "frictionloss", "springdamper", "ref"}
+        _refuse_unknown_attributes(joint, joint_text, covered)
         unit = self.angle_unit if kind == "hinge" else 1.0
         return JointRecord(
             kind == "slide",
@@ -318,9 +352,14 @@ class _MjcfReader:
         if not kinds:
             return np.eye(3), position
         if kinds[0] == "quat":
-            return Rotation.from_quat(np.roll(_number_array_attribute(element, "quat", 4), -1)).as_matrix(), position
+            quaternion = _number_array_attribute(element, "quat", 4)
+            if not quaternion.any():
+                raise InputError(f"quat of {element.tag!r} must not be zero")
+            return Rotation.from_quat(np.roll(quaternion, -1)).as_matrix(), position
         if kinds[0] == "axisangle":
             *axis, angle = _number_array_attribute(element, "axisangle", 4)
+            if not any(axis):
+                raise InputError(f"the axis in axisangle of {element.tag!r} must not be zero")
             direction = np.array(axis) / np.linalg.norm(axis)
             return Rotation.from_rotvec(self.angle_unit * angle * direction).as_matrix(), position
         if kinds[0] == "euler":
@@ -331,6 +370,11 @@ class _MjcfReader:
 
 def _read_mjcf_inertia(inertial: Element, name: str) -> np.ndarray:
     """Read the tensor of inertia of an MJCF body in axes of the inertial frame, shape (3, 3)."""
+    attributes = ("diaginertia", "fullinertia", *MJCF_ORIENTATIONS)
+    _refuse_unknown_attributes(inertial, f"the inertial of {name!r}", {"pos", "mass", *attributes})
+    others = [key for key in attributes if key != "fullinertia" and key in inertial.attrib]
+    if "fullinertia" in inertial.attrib and others:
+        raise InputError(f"the inertial of {name!r} must not have {others[0]} beside fullinertia")
     if "fullinertia" in inertial.attrib:
         return _symmetric_matrix(*_number_array_attribute(inertial, "fullinertia", 6))
     if "diaginertia" in inertial.attrib:
@@ -519,6 +563,12 @@ def _refuse_unknown_children(
             )
 
 
+def _refuse_unknown_attributes(element: Element, element_text: str, covered_attributes: set[str]) -> None:
+    """Raise InputError if an XML element has an attribute that is not covered."""
+    if unknown := sorted(set(element.attrib) - covered_attributes):
+        raise InputError(f"the attribute {unknown[0]!r} of {element_text} is not covered")
+
+
 def _refuse_nonzero_attribute(element: Element, attribute_name: str, owner_text: str) -> None:
     """Raise InputError if an XML attribute has a value that is not zero."""
     if (
@@ -532,10 +582,22 @@ def _required_only_child(element: Element, tag: str) -> Element:
     """Return the child of an XML element with this tag; raise InputError unless there is exactly one."""
     children = element.findall(tag)
     if len(children) != 1:
-        name = element.get("name")
-        element_text = element.tag if name is None else f"{element.tag} {name!r}"
-        raise InputError(f"{element_text} must have one {tag!r}, got {len(children)}")
+        raise InputError(f"{_element_text(element)} must have one {tag!r}, got {len(children)}")
     return children[0]
+
+
+def _optional_only_child(element: Element, tag: str) -> Element | None:
+    """Return the child of an XML element with this tag, or None; raise InputError if there are several."""
+    children = element.findall(tag)
+    if len(children) > 1:
+        raise InputError(f"{_element_text(element)} must have at most one {tag!r}, got {len(children)}")
+    return children[0] if children else None
+
+
+def _element_text(element: Element) -> str:
+    """Return the tag of an XML element, and its name if it has one."""
+    name = element.get("name")
+    return element.tag if name is None else f"{element.tag} {name!r}"
 
 
 def _required_attribute(element: Element, attribute_name: str) -> str:

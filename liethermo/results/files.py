@@ -132,7 +132,7 @@ def read_csv(path: str | os.PathLike) -> AttitudeHistory:
     Raises
     ------
     FileError
-        If the file cannot be read, a column is missing, or its numbers are not attitudes.
+        If the file cannot be read, a column is missing or there twice, or its numbers are not finite or no attitudes.
     """
     path = checked_path(path)
     try:
@@ -153,7 +153,17 @@ def read_csv(path: str | os.PathLike) -> AttitudeHistory:
         missing_columns += [name for name in RATE_COLUMNS if name not in names]
     if missing_columns:
         raise FileError(f"{path} has no column {missing_columns[0]!r}; its columns are {', '.join(header)}")
+    for name in ("t", *QUATERNION_COLUMNS, *rate_names):
+        if names.count(name) > 1:
+            raise FileError(f"{path} has {names.count(name)} columns {name!r}, so which one counts is not known")
+    for name in ("t", *rate_names):  # the norm of a quaternion shows its entries that are not finite
+        if not (is_finite := np.isfinite(values[:, names.index(name)])).all():
+            line = int(np.argmin(is_finite)) + 2
+            raise FileError(f"{path} has a number in the column {name!r}, line {line}, that is not finite")
     units = dict(columns)
+    for name in QUATERNION_COLUMNS:
+        if units[name] not in ("", "1"):
+            raise FileError(f"{path} has {name} in {units[name]!r}, but components of a quaternion have no unit")
     time_factor = _factor_to_si(path, "times", units["t"], "s")
     q = values[:, [names.index(name) for name in QUATERNION_COLUMNS]]
     norms = np.linalg.norm(q, axis=1)

@@ -111,6 +111,12 @@ def test_an_mjcf_file_is_the_tree_built_by_hand():
                       '<joint name="ring" type="continuous"><parent link="mass"/>'), "are in a loop of joints"),
         (URDF.replace('iyy="0.4"', 'iyy="9"'), "no rigid body has the inertia of 'panel'"),
         ("<mujoco/>", "the root element 'robot'"),
+        (URDF.replace('<link name="mass">', '<link name="panel"/><link name="mass">'), "two links .* 'panel'"),
+        (URDF.replace('<dynamics damping="0.3"/>', '<dynamics damping="0.3" K="5"/>'), "K of .* must be zero, got '5'"),
+        (URDF.replace('<origin xyz="0.2 0 0"/>', '<origin xyz="0.2 0 0" quat_xyzw="0 0 1 0"/>'),
+         "'quat_xyzw' of the origin in joint 'hinge'"),
+        (URDF.replace('<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><axis xyz="0 0 1"/>'), "at most one 'axis', got 2"),
+        (URDF.replace('<origin xyz="1 0 0"/>', '<origin xyz="1 0 0"/><origin xyz="2 0 0"/>'), "at most one 'origin'"),
     ],
 )  # fmt: skip
 def test_urdf_that_is_not_covered_is_refused(text, message):
@@ -133,11 +139,36 @@ def test_urdf_that_is_not_covered_is_refused(text, message):
         (MJCF.replace('timestep="0.001"', 'viscosity="0.1"'), "viscosity of option must be zero, got '0.1'"),
         (MJCF.replace('pos="0.8 0 0" mass', 'pos="0.8 0" mass'), "must be 3 finite numbers"),
         (MJCF.replace('<joint axis="1 0 0" damping="0"/>', '<joint type="slide" axis="1 0 0"/>'), "slide and hinge"),
+        (MJCF.replace("<freejoint/>", '<joint type="free"/>'), "damping of the free joint of 'bus' must be zero"),
+        *((MJCF.replace("<freejoint/>", f'<joint type="free" damping="0" {load}="0.5"/>'), f"{load} of the free joint")
+          for load in ("armature", "stiffness", "frictionloss")),
+        (MJCF.replace("<freejoint/>", '<freejoint align="true"/>'), "align='true' of the free joint of 'bus'"),
+        (MJCF.replace("<default>", '<option><flag spring="disable"/></option><default>'), "spring='disable' of flag"),
+        (MJCF.replace("<default>", '<option><flag damper="disable"/></option><default>'), "damper='disable' of flag"),
+        (MJCF.replace("<default>", '<default class="stiff">'), "class='stiff' of default"),
+        (MJCF.replace('quat="0.7071067811865476 0.7071067811865476 0 0"', 'quat="0 0 0 0"'), "quat of 'body' .* zero"),
+        (MJCF.replace('name="tip"', 'name="tip" axisangle="0 0 0 1"'), "the axis in axisangle of 'body'"),
+        (MJCF.replace('name="tip"', 'name="tip" position="0 0 1"'), "'position' of the body 'tip'"),
+        (MJCF.replace('mass="10"', 'mass="10" density="3"'), "'density' of the inertial of 'bus'"),
+        (MJCF.replace('fullinertia="', 'diaginertia="1 1 1" fullinertia="'), "'panel' .* not have diaginertia beside"),
+        (MJCF.replace('fullinertia="', 'quat="1 1 0 0" fullinertia="'), "'panel' .* not have quat beside"),
+        (MJCF.replace('<geom type="box" size="1 1 1"/>', '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'),
+         "body 'bus' must have at most one 'inertial', got 2"),
+        (MJCF.replace('name="tip"', 'name="tip" gravcomp="1"'), "gravcomp of the body 'tip'"),
+        (MJCF.replace('name="tip"', 'name="tip" childclass="a"'), "the attribute 'childclass' of the body 'tip'"),
     ],
-)
+)  # fmt: skip
 def test_mjcf_that_is_not_covered_is_refused(text, message):
     with pytest.raises(lt.InputError, match=message):
         lt.bodies.Tree.from_mjcf(text)
+
+
+def test_settings_of_mjcf_in_several_elements_count_together():
+    """MuJoCo merges sections that appear twice; what does not act on the motion is accepted."""
+    text = MJCF.replace('<compiler angle="radian"/>', '<compiler angle="radian"/><compiler autolimits="true"/>')
+    text = text.replace("<freejoint/>", '<joint type="free" damping="0" pos="1 2 3" ref="0"/>')
+    text = text.replace('name="tip"', 'name="tip" gravcomp="0.0"')
+    assert_equal_motion(lt.bodies.Tree.from_mjcf(text), lt.bodies.Tree.from_mjcf(MJCF), ["panel", "tip"])
 
 
 def test_a_file_that_does_not_exist():
