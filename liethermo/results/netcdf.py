@@ -135,17 +135,14 @@ class SaveableResult(metaclass=ListedABCMeta):
     def save(self, path: str | os.PathLike, units: Mapping[str, str] | None = None) -> Path:
         """Write a NetCDF file, which :func:`load` reads; it is complete or does not appear at all.
 
+        FileError if the file cannot be written, InputError if a name in ``units`` has no variable.
+
         Parameters
         ----------
         path : path
             The file to write.
         units : dict of str, optional
             Units by the name of a variable: see :meth:`to_xarray`.
-
-        Raises
-        ------
-        FileError, InputError
-            If the file cannot be written, or a name in ``units`` has no variable.
         """
         return write_dataset(self.to_xarray(units), path)
 

@@ -71,11 +71,9 @@ class SpinSystem(TorqueSystem):
     baths : HeatBaths, optional
         The baths that take the heat of the damping.
     ratio : float, or array of the shape of the sites
-        gamma_i.
-    momentum_maps : dict of functions, or a sequence of them
-        Of s, shape ``(*sites, 3)``.
-    validate : bool
-        Test the axioms at a few random points.
+        gamma_i (1 / (energy * time), if s has no unit).
+    momentum_maps, validate
+        As for :class:`LiePoissonSystem`; functions of s, shape ``(*sites, 3)``.
     torque : function w of t, shape (), and s, shape ``(*sites, 3)``; or a list of them; optional
         Torques ``s x w`` (w in 1 / time) from outside, such as ``lt.magnetism.Slonczewski``. Each |s_i| stays constant.
         The torque does the work W, ``W' = sum grad_i H . (s_i x w_i)``, and the energy less the work is constant.
@@ -86,6 +84,7 @@ class SpinSystem(TorqueSystem):
     Raises
     ------
     InputError, FunctionError, AxiomError
+        If an argument or a function does not fit, or an axiom fails.
 
     Examples
     --------
@@ -204,22 +203,16 @@ class SpinSystem(TorqueSystem):
         """Return the largest step (time) in which no spin turns by more than an ``angle``, in its field or by noise.
 
         A spin turns at the rate ``sqrt(ratio^2 + (rate |s|)^2) |grad_i H|`` at most. Noise turns it by angles of the
-        variance ``2 k T rate h`` in each component, which is kept below the square of the angle.
+        variance ``2 k T rate h`` in each component, which is kept below the square of the angle. InputError if no spin
+        turns.
 
         Parameters
         ----------
         x : array, shape (n,) or ``(*sites, 3)``
         angle : float > 0
             In radian. Steps with noise have a bias of about a per cent with 0.3 [:doc:`/explanation/fluctuations`].
-        boltzmann : float >= 0
-            k, as of ``lt.Fluctuations``, for steps with noise; the temperatures are those of the baths.
-        t : float
-            The time, for an energy or a temperature that depends on it.
-
-        Raises
-        ------
-        InputError
-            If no spin turns.
+        boltzmann, t : float >= 0, and float
+            k, as of ``lt.Fluctuations``, for steps with noise at the temperatures of the baths; and the time.
         """
         state, spins, n = self.state(x), self._spin_structure, self.body_dim
         assert spins is not None
