@@ -255,7 +255,8 @@ class Tree(metaclass=ListedType):
         ...   <link name="bus"><inertial><mass value="10"/>
         ...     <inertia ixx="3" iyy="2" izz="1.5" ixy="0" ixz="0" iyz="0"/></inertial></link>
         ...   <link name="panel"><inertial><origin xyz="0.8 0 0"/><mass value="2"/>
-        ...     <inertia ixx="0.05" iyy="0.4" izz="0.42" ixy="0" ixz="0" iyz="0"/></inertial></link>
+        ...     <inertia ixx="0.05" iyy="0.4" izz="0.42" ixy="0" ixz="0" iyz="0"/>
+        ...   </inertial></link>
         ...   <joint name="hinge" type="continuous"><parent link="bus"/><child link="panel"/>
         ...     <origin xyz="0.5 0 0"/><axis xyz="0 1 0"/><dynamics damping="0.3"/></joint>
         ... </robot>''')
@@ -288,8 +289,10 @@ class Tree(metaclass=ListedType):
         Examples
         --------
         >>> tree = lt.bodies.Tree.from_mjcf('''<mujoco><option gravity="0 0 0"/><worldbody>
-        ...   <body name="bus"><freejoint/><inertial pos="0 0 0" mass="10" diaginertia="3 2 1.5"/>
-        ...     <body name="panel" pos="0.5 0 0"><joint type="hinge" axis="0 1 0" damping="0.3"/>
+        ...   <body name="bus"><freejoint/>
+        ...     <inertial pos="0 0 0" mass="10" diaginertia="3 2 1.5"/>
+        ...     <body name="panel" pos="0.5 0 0">
+        ...       <joint type="hinge" axis="0 1 0" damping="0.3"/>
         ...       <inertial pos="0.8 0 0" mass="2" diaginertia="0.05 0.4 0.42"/></body></body>
         ... </worldbody></mujoco>''')
         >>> tree.names
