@@ -120,9 +120,9 @@ def project_onto_levels(
     less the smaller it is.
 
     Near an equilibrium the entropy is almost the largest that the conserved functions allow. If a step overestimates
-    the production, the levels may have no common point. Corrections along gradients that depend on each other would
-    then wander, and miss all levels by rounding of one sign. So the amount by which a function rises or falls is left
-    open there: it changes as the others determine, or not at all if that change has the wrong sign.
+    the production, the levels may have no common point. Corrections along linearly dependent gradients would then
+    not converge, and the rounding errors on all levels would have one sign. So such a function has no prescribed
+    change: it changes as the others determine, or not at all if that change has the wrong sign.
     """
     discrete_gradient, surface, clock = CHANGE_GRADIENT, system.constraint_surface, system.clock
     work_direction = None if clock is None else clock.work_direction(system.dim)

@@ -164,7 +164,7 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         start = self._centre_of_mass_index
         if start is None:
             raise InputError(
-                "the tree has no position: build it by tree.system(gravity=(0, 0, 0)), or in another field"
+                "the tree has no position. Build it by tree.system(gravity=(0, 0, 0)), or with another uniform field"
             )
         return self.state(x, batch=True)[..., start : start + 3]
 
@@ -264,8 +264,8 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         if self._centre_of_mass_index is None:
             if centre_of_mass is not None or velocity is not None:
                 raise InputError(
-                    "centre_of_mass= and velocity= are for a tree with a position: build it by "
-                    "tree.system(gravity=(0, 0, 0)), or in another uniform field"
+                    "centre_of_mass= and velocity= need a tree with a position. Build it by "
+                    "tree.system(gravity=(0, 0, 0)), or with another uniform field"
                 )
             return ()
         values = {"centre_of_mass": centre_of_mass, "velocity": velocity}

@@ -154,7 +154,7 @@ class Tree(metaclass=ListedType):
     def base(self) -> str:
         """Name of the base."""
         if not self._bodies:
-            raise InputError("the tree has no bodies: add a base first")
+            raise InputError("the tree has no bodies. Add a base first")
         return next(iter(self._bodies))
 
     def __repr__(self) -> str:

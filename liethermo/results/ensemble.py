@@ -186,7 +186,7 @@ class Ensemble(AuditableResult):
         """
         i = self._checked_member_index(i)
         if self.x is None:
-            raise InputError('no states were kept: run the ensemble with outputs="final" or "trajectory"')
+            raise InputError('no states were kept. Run the ensemble with outputs="final" or "trajectory"')
         if self.status[i] == StatusCode.INADMISSIBLE:
             raise InputError(self.message(i))
         return self.member_solution(i) if self.solution_builder is None else self.solution_builder(self, i)

@@ -263,7 +263,7 @@ class Solution(AuditableResult):
             Unless the run was made with ``dense=True`` and covers the times.
         """
         if self.dense is None:
-            raise InputError("this solution has no dense output; ask for it with integrate(..., dense=True)")
+            raise InputError("this solution has no dense output. Run integrate(..., dense=True)")
         states = self.dense(t)
         return states.reshape(*states.shape[:-1], *self.x.shape[1:])
 

@@ -231,7 +231,7 @@ def join_baths(first_baths: HeatBaths, second_baths: HeatBaths) -> HeatBaths:
         return first_baths if first_baths.number else second_baths
     kinds = BathEnergy | ReservoirEnergy
     if not isinstance(first_baths.energy, kinds) or not isinstance(second_baths.energy, kinds):
-        raise InputError("baths of a product have constant capacities: build the product with baths of its own")
+        raise InputError("baths of a product have constant capacities. Build the product with baths of its own")
     capacity, temperature = (
         jnp.concatenate([getattr(first_baths.energy, name), getattr(second_baths.energy, name)])
         for name in ("capacity", "temperature")

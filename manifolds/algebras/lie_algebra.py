@@ -495,7 +495,7 @@ class LieAlgebra(StructureMethods):
         """Return the matrices of the basis; raise LieAlgebraError if the algebra has none."""
         if self.basis is None:
             raise LieAlgebraError(
-                f"{self.name} was defined by structure constants and has no matrices; build it with "
+                f"{self.name} was defined by structure constants and has no matrices. Build it with "
                 "LieAlgebra.from_matrices to use hat and vee"
             )
         return self.basis

@@ -200,7 +200,7 @@ def subalgebra_basis(group: MatrixGroup, spanning_matrices) -> np.ndarray:
         if (residual := np.linalg.norm(bracket - rows.T @ (rows @ bracket))) > SUBALGEBRA_TOLERANCE:
             raise ParameterError(
                 f"the stabilizer in {group.name} is not a subalgebra: the bracket of its directions {j} and {i} is "
-                f"{residual:.2g} off their span; add what is missing"
+                f"{residual:.2g} off their span. Add the missing directions"
             )
     return rows
 
