@@ -164,9 +164,8 @@ class MetriplecticTaylor(ExplicitMethod):
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
         """Estimate the error from the residual of the polynomial X at its end: ``h |f(X(1)) - X'(1)| / (p + 1)``.
 
-        At the end of a step the first neglected term of X' is p + 1 times that of X, so the ratio of estimate and
-        error tends to 1 with h. It
-        also detects a condition (``jnp.where``) whose value has changed inside the step.
+        At the end of a step the first neglected term of X' is p + 1 times that of X, so the ratio of estimate and error
+        tends to 1 with h. It also detects a condition (``jnp.where``) whose value has changed inside the step.
         """
         return h * jnp.max(
             jnp.abs(convert_work_error_to_displacement(system, x, k[StepRow.ERROR], k[StepRow.MEAN_SLOPE]))

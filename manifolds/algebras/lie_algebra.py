@@ -461,10 +461,8 @@ class LieAlgebra(StructureMethods):
         """Return pairs (name, Casimir) of low degree that are quick to find and to evaluate, to follow along a motion.
 
         The Casimirs are functions from mu, shape (dim,), to a number. A small algebra has its polynomial ones, as many
-        as
-        there are; copies on sites have the Casimirs of a few copies, or the sums over many; a large matrix algebra has
-        the
-        traces of the first powers.
+        as there are; copies on sites have the Casimirs of a few copies, or the sums over many; a large matrix algebra
+        has the traces of the first powers.
         """
         return leading_casimirs(self)
 

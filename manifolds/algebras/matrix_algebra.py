@@ -289,6 +289,13 @@ class MatrixTrace:
     """Casimir ``tr(M(mu)**degree)``, for anti-Hermitian matrices ``tr((i M)**degree)``: shape (..., dim) to (...).
 
     M(mu) is :meth:`MatrixAlgebra.dual_matrix`.
+
+    Parameters
+    ----------
+    algebra : MatrixAlgebra
+        The algebra.
+    degree : int
+        The power of the matrix.
     """
 
     algebra: MatrixAlgebra
