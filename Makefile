@@ -19,7 +19,7 @@ require = @command -v "$(PYTHON)" >/dev/null || { echo "$(PYTHON) was not found;
 help:
 	@echo "make demo       run a tumbling body with friction inside; results go to demo_output/"
 	@echo "make test       linters, types, layer rule and the tests, without the slow ones"
-	@echo "make test-slow  the slow tests; with PART=3/8 the third of eight parts of them"
+	@echo "make test-slow  the slow tests; with PART=3/4 the third of four parts of them"
 	@echo "make fuzz       random functions by the compiler and by JAX, for a minute (SECONDS=600 for ten)"
 	@echo "make docs       build the documentation in docs/_build/html"
 	@echo "make docs-check walk the built site in a headless Chromium; screenshots in docs/_build/screenshots"

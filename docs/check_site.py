@@ -3,8 +3,8 @@
 It looks for console errors, files that do not load, links and anchors that lead nowhere, formulas and tables that stay
 raw, printed numbers that are not rounded, pages wider than their screen, tables and code that are clipped, text that a
 picture squeezes, and words that the search does not find. In the sources it looks for code in passing that is not true,
-numbers that differ from page to page, paragraphs that begin within a line, and code wider than a page. Pictures of
-pages, at two widths, light and dark, go to ``docs/_build/screenshots``.
+numbers that differ from page to page, paragraphs that begin within a line, and code wider than a page, in docstrings
+too. Pictures of pages, at two widths, light and dark, go to ``docs/_build/screenshots``.
 """
 
 from __future__ import annotations
@@ -321,7 +321,13 @@ def check_sources(docs: Path) -> list[str]:
     examples = {
         str(file.relative_to(docs.parent)): file.read_text() for file in docs.parent.glob("examples/*/plot_*.py")
     }
-    return [problem for check in checks for problem in check(pages)] + list(check_text.wide_examples(examples))
+    modules = {
+        str(file.relative_to(docs.parent)): file.read_text()
+        for package in ("liethermo", "manifolds")
+        for file in sorted((docs.parent / package).rglob("*.py"))
+    }
+    problems = [problem for check in checks for problem in check(pages)]
+    return [*problems, *check_text.wide_examples(examples), *check_text.wide_docstrings(modules)]
 
 
 def take_pictures(chromium: Browser, html: Path) -> None:

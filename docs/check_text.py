@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import html
 import re
 import sys
@@ -83,6 +84,16 @@ def wide_examples(examples: Mapping[str, str]) -> Iterator[str]:
         for line in code.splitlines():
             if len(line) > MAX_COLUMNS and not line.startswith("#"):
                 yield f"{name}: code has {len(line)} columns, at most {MAX_COLUMNS} are shown: {line[:80]}"
+
+
+def wide_docstrings(modules: Mapping[str, str]) -> Iterator[str]:
+    """Yield the lines of code in the docstrings of Python modules that are wider than a page of the site."""
+    for name, text in modules.items():
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+                for line in (ast.get_docstring(node) or "").splitlines():
+                    if len(line) > MAX_COLUMNS and line.lstrip().startswith((">>> ", "... ")):
+                        yield f"{name}: code has {len(line)} columns, at most {MAX_COLUMNS} are shown: {line[:80]}"
 
 
 def untrue_spans(pages: Mapping[str, str]) -> Iterator[str]:

@@ -49,7 +49,7 @@ class SuitePart:
         try:
             number, count = map(int, text.split("/"))
         except ValueError:
-            raise pytest.UsageError(f"--part must be K/N, such as 3/8, got {text!r}") from None
+            raise pytest.UsageError(f"--part must be K/N, such as 3/4, got {text!r}") from None
         if not 1 <= number <= count:
             raise pytest.UsageError(f"--part must be from 1/{count} to {count}/{count}, got {text!r}")
         self.number, self.count = number, count

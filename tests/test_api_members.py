@@ -135,7 +135,7 @@ def test_a_summary_that_begins_with_a_formula_is_found(line):
 
 # -- help() -----------------------------------------------------------------------------------------------------------
 
-TWO_SCREENS = 112
+TWO_SCREENS = 100
 """Largest number of lines of the help of a class."""
 
 FIRST_CLASSES = (

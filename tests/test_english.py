@@ -73,7 +73,9 @@ KINDS = {
     "examples": (EXAMPLES, paragraphs_of_example),
 }
 
-UNCLEAR_MESSAGE = re.compile(r"\b(is|are|has|have|must)\b[^.;]*, not x|[:;] (give|take|use|set|leave|write|remove) ")
+CURE_VERBS = "give|take|use|set|leave|write|remove|build|add|ask|run|raise|replace|make|call|pass|install|try|choose"
+
+UNCLEAR_MESSAGE = re.compile(rf"\b(is|are|has|have|must)\b[^.;]*, not x|[:;] ({CURE_VERBS}) ")
 """A message that does not say "must be Y, got Z", or whose cure is no sentence of its own."""
 
 
@@ -108,7 +110,10 @@ def test_messages_say_what_must_be_what_was_given_and_the_cure():
     assert not unclear, "\n".join(unclear)
 
 
-@pytest.mark.parametrize("message", ["a rate must be >= 0, not x", "x depends on time: take system.at_time(t)"])
+@pytest.mark.parametrize(
+    "message",
+    ["a rate must be >= 0, not x", "x depends on time: take system.at_time(t)", "x has no bodies; add a base"],
+)
 def test_an_unclear_message_is_found(message):
     assert UNCLEAR_MESSAGE.search(message)
     assert not UNCLEAR_MESSAGE.search("a rate must be >= 0, got x. Use its absolute value")

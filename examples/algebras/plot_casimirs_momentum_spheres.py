@@ -18,8 +18,8 @@ import manifolds as mf
 energy = lt.Quadratic([1.0, 0.5, 0.2])
 
 # %%
-# For each algebra the degree of its Casimir C, and the surface C = 1 in parameters a and b from -1 to 1. Bianchi VIII
-# is sl(2, R) in a basis whose Casimir is a sum of squares.
+# Each algebra has a Casimir C of the given degree, and the surface C = 1 has parameters a and b from -1 to 1. Bianchi
+# VIII is sl(2, R) in a basis whose Casimir is a sum of squares.
 
 a, b = np.meshgrid(np.linspace(-1, 1, 61), np.linspace(-1, 1, 121), indexing="ij")
 cos, sin = np.cos(np.pi * b), np.sin(np.pi * b)

@@ -3,8 +3,8 @@ Why may a slender satellite spin about its long axis?
 =====================================================
 
 A body with friction ends in a spin about its axis of greatest inertia. Some communication satellites are longer than
-wide, but they spin about the long axis: their platform is despun, and a damper on it works harder than the friction in
-the rotor. Likins gave the condition in 1967 (J. Spacecraft and Rockets 4, 1638): the nutation decays if
+wide, but they spin about the long axis: their platform is despun, and a damper on it dissipates more than the friction
+in the rotor. Likins gave the condition in 1967 (J. Spacecraft and Rockets 4, 1638): the nutation decays if
 
 .. math:: \frac{P_p}{\lambda_p} + \frac{P_r}{\lambda_r} > 0,
 

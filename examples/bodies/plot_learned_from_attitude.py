@@ -2,8 +2,8 @@ r"""
 A body from its attitude alone
 ==============================
 
-A satellite tumbles with friction inside. A camera sees its attitude, and nothing else. What are its moments of inertia,
-and how strong is the friction?
+A satellite with internal friction tumbles. A camera sees its attitude, and nothing else. What are its moments of
+inertia, and how strong is the friction?
 
 No torque acts, so the momentum in space is constant. In body axes the momentum is then :math:`\mu(t) = R(t)^T \pi`,
 with one unknown vector :math:`\pi`. The body turns with the velocity :math:`\xi + \sigma`, its ``transport``, which a
@@ -26,7 +26,7 @@ body = lt.models.tumbling_body(INERTIA, rate=RATE)
 run = lt.integrate(body, START, (0.0, 20.0), 0.1, method)
 
 # %%
-# The record: attitudes with errors of 1e-4 radians, and the angular velocities of a spline through them.
+# The record has attitudes with errors of 1e-4 radians, and the angular velocities of a spline through them.
 
 random = np.random.default_rng(0)
 seen = Rotation.from_matrix(run.attitude) * Rotation.from_rotvec(

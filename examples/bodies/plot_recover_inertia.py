@@ -29,7 +29,7 @@ def momenta(parameters):
 
 
 # %%
-# The record: the true motion and noise.
+# The record is the true motion with noise.
 
 noise = 0.02
 record = momenta(TRUE) + noise * np.random.default_rng(0).standard_normal(

@@ -31,7 +31,7 @@ ideal = lt.integrate(
 print(ideal.audit())
 
 # %%
-# The same flow with friction, by the double bracket.
+# The double bracket adds friction to this flow.
 
 damped = lt.integrate(
     lt.models.magnetic_fluid(N, rate=0.004),

@@ -4,10 +4,10 @@ Where does a decaying flow on a sphere end?
 
 An ideal fluid on the sphere conserves its energy and the integral of every function of its vorticity. A real fluid
 first loses enstrophy, in filaments that are too fine to be seen, while its energy is nearly constant. This is
-*selective decay*. Here it is a metriplectic system on the dual of su(N), Zeitlin's model of the fluid. The vorticity is
-an N by N matrix W. The energy is constant to rounding, and the enstrophy falls in every step, by a ``K`` of commutators
-with the stream function P. It falls until ``[P, W] = 0``. Then the flow is steady, and its vorticity is a function of
-its stream function.
+*selective decay*. This example computes it by a metriplectic system on the dual of su(N), Zeitlin's model of the fluid.
+The vorticity is an N by N matrix W. The energy is constant to rounding, and the enstrophy falls in every step, by a
+``K`` of commutators with the stream function P. It falls until ``[P, W] = 0``. Then the flow is steady, and its
+vorticity is a function of its stream function.
 """
 
 import matplotlib.pyplot as plt
@@ -71,7 +71,7 @@ print(
 )
 
 # %%
-# The energy to rounding, and the enstrophy.
+# The figure shows the energy, which is constant to rounding, and the enstrophy.
 
 energy, enstrophy = solution.energy, -solution.entropy
 print(

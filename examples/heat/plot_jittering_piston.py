@@ -5,8 +5,8 @@ How much does a piston between two gases jitter?
 Two gases push a piston from both sides. Its mean position is where the pressures agree, but molecules hit it, and so it
 never rests. The size of its motion follows from the entropy: a displacement d changes the entropy of the gases by
 ``-d^2 / 2 (n_l R / q^2 + n_r R / (L - q)^2)``, so the variance of the position is k over that bracket. With the real k
-the motion is smaller than an atom. Here k is larger, as for gases of few molecules. The total energy is exact on every
-path.
+the motion is smaller than an atom. This example uses a larger k, as for gases of few molecules. The total energy is
+exact on every path.
 """
 
 import matplotlib.pyplot as plt

@@ -104,17 +104,17 @@ def draw(case, runs):
 # temperature are constant. With a friction of 10 the case is critically damped, a branch that the exact solution in the
 # paper leaves out.
 #
-# The paper says that the error of scheme 1 decreases in time and that those of schemes 2 and 3 stay constant. Here the
-# error of scheme 1 decreases until the mass rests. The error of scheme 2 is rounding without friction, and otherwise
-# *grows* with the heat to 1.5e-11 and stays there. The error of scheme 3 oscillates up to 3.01e-11 and settles at the
-# same value. When the mass has come to rest, all three have the same error.
+# The paper says that the error of scheme 1 decreases in time and that those of schemes 2 and 3 stay constant. In
+# this run the error of scheme 1 decreases until the mass rests. The error of scheme 2 is rounding without friction, and
+# otherwise *grows* with the heat to 1.5e-11 and stays there. The error of scheme 3 oscillates up to 3.01e-11 and
+# settles at 1.5e-11. When the mass has come to rest, all three have the same error.
 
 runs = study(1)
 draw(1, runs)
 
 # %%
-# Case 2, a heavier mass on a stiffer spring in twice the gas. The bounds in the paper, 1e-6 for scheme 1 and 1e-9 for
-# the others, are a hundred times wider than needed.
+# Case 2 has a heavier mass on a stiffer spring in twice the gas. The bounds in the paper, 1e-6 for scheme 1 and 1e-9
+# for the others, are a hundred times wider than needed.
 
 draw(2, study(2))
 plt.show()

@@ -30,8 +30,8 @@ def lagrangian(q, v, S):
 pendulum = lt.SimpleClosedSystem(lagrangian, friction=r, space=mf.Sphere(2))
 
 # %%
-# The same motion in two angles, for comparison: :math:`\theta` from the upward vertical, and :math:`\varphi` around it.
-# SciPy solves it at 1e-13.
+# For comparison, SciPy solves the equations of two angles at a tolerance of 1e-13: :math:`\theta` from the upward
+# vertical, and :math:`\varphi` around it.
 
 
 def in_angles(t, y):

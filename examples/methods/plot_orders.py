@@ -2,8 +2,9 @@
 Order after order, with both laws exact
 =======================================
 
-``MetriplecticGauss`` of s stages is of order 2s. Here neither the energy nor the entropy is quadratic, on two algebras:
-a body with an anharmonic energy on so(3)*, and a top-like system on se(3)* whose entropy is a function of a Casimir.
+``MetriplecticGauss`` of s stages is of order 2s. Two systems test this, in which neither the energy nor the
+entropy is quadratic: a body with an anharmonic energy on so(3)*, and a top-like system on se(3)* whose entropy is a
+function of a Casimir.
 The error falls as h to the power 2s. At every point of the picture, also for the longest steps, the energy is constant
 to rounding and the entropy grows.
 """

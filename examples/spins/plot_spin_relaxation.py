@@ -3,8 +3,9 @@ How does a spin come to rest on its sphere?
 ===========================================
 
 A spin is a unit vector s, and ``s' = s x grad H`` moves it along the lines of constant energy of the sphere. With
-damping it moves to the least energy. Here the lost energy heats a bath of temperature T = exp(S), and spin and bath are
-an isolated system: the state is a point of S^2 x R, the energy of the whole is constant, and the entropy S grows.
+damping it moves to the least energy. In this example the lost energy heats a bath of temperature T = exp(S), and spin
+and bath are an isolated system: the state is a point of S^2 x R, the energy of the whole is constant, and the entropy S
+grows.
 """
 
 import jax.numpy as jnp

@@ -89,7 +89,8 @@ for kind, build in KINDS.items():
         found[kind, name] = study.results
 
 # %%
-# The remaining error over the friction, for each kind and scheme, for the three steps and the stiffest spring.
+# The figure shows the remaining error over the friction, for each kind and scheme, the three steps and the stiffest
+# spring.
 
 stiffness = np.array(AXES["stiffness"])
 
@@ -141,7 +142,7 @@ axes[0].legend(frameon=False, fontsize="x-small")
 plt.show()
 
 # %%
-# The results, relative to the initial mechanical energy and for the stiffest spring:
+# The results are relative to the initial mechanical energy and hold for the stiffest spring:
 #
 # - *Without a drive nothing grows.* Once the mass has come to rest, the error is the same after a quarter of the time
 #   and after all of it, to a percent, for both schemes. Beside a gas it is at most 4.5e-6 for scheme 2 and 9.1e-6 for

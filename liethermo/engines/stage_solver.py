@@ -263,7 +263,7 @@ def solve_newton(
 def best_guess_and_residual(residual_function: Callable, guess: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the guess of the slopes with the smaller residual, given or zero, and this residual.
 
-    Far from a solution Newton's method may wander.
+    Far from a solution Newton's method may not converge.
     """
     zero_slopes, zero_count = jnp.zeros_like(guess), jnp.zeros((), dtype=jnp.int64)
 

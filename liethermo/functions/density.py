@@ -30,7 +30,7 @@ REST_RTOL = 4.0 * float(np.finfo(np.float64).eps)
 
 
 DEFECT_RTOL = float(np.finfo(np.float64).eps)
-"""Defect of the entropy in a step, relative to the length of its gradient and of the state, that is not corrected."""
+"""Largest defect of the entropy in a step, relative to |gradient| |state|, that is left without a correction."""
 
 
 class VonNeumann(Energy):

@@ -344,6 +344,13 @@ class Function(Energy):
 
     The function may be an ``equinox.Module``, whose arrays are then parameters of the system.
 
+    Parameters
+    ----------
+    function : callable
+        From x, shape (n,), to a scalar, by jax.numpy.
+    degree : float, optional
+        Degree of a polynomial, for which methods have special formulas; infinite by default.
+
     Examples
     --------
     >>> well = lt.Function(lambda x: x[0] ** 4 / 4 - x[0] ** 2 / 2)

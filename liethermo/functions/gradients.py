@@ -130,6 +130,11 @@ class MeanValue(DiscreteGradient):
 
     The quadrature is exact for polynomials of degree up to ``2 * nodes``; for other functions its defect is added along
     d, so that the defining identity, and with it the energy, holds for every H.
+
+    Parameters
+    ----------
+    nodes : int
+        The number of nodes of the quadrature.
     """
 
     nodes: int = eqx.field(static=True, default=5)

@@ -206,8 +206,8 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         gradients = np.nan_to_num(evaluate_at_points(stack_gradients, tuple(functions), system.samples(8)))
         if np.linalg.matrix_rank(gradients, tol=1e-9).max() >= system.dim:
             raise InputError(
-                f"energy, entropy and {len(self.functions)} preserved functions are independent and leave no room to "
-                f"move in {system.dim} dimensions. Preserve fewer functions"
+                f"energy, entropy and {len(self.functions)} preserved functions are independent, so no motion "
+                f"remains in {system.dim} dimensions. Preserve fewer functions"
             )
 
     # -- the stage equations ------------------------------------------------------------------------------------------

@@ -114,15 +114,14 @@ def project_onto_levels(
     """Return the displacement nearest to d that changes the functions by ``target_changes``, and its residual.
 
     The residual is the length by which the displacement misses these changes. ``start_gradients`` are the gradients of
-    the functions at x + compensation.
-    With ``follow_leaf`` the displacement is along the symplectic leaf, and d is the covector that carries the state.
-    The first ``momentum_dim`` components are a momentum of constant length, which corrections leave at zero, and move
-    less the smaller it is.
+    the functions at x + compensation. With ``follow_leaf`` the displacement is along the symplectic leaf, and d is the
+    covector that carries the state. The first ``momentum_dim`` components are a momentum of constant length, which
+    corrections leave at zero, and move less the smaller it is.
 
     Near an equilibrium the entropy is almost the largest that the conserved functions allow. If a step overestimates
-    the production, the levels may have no common point. Corrections along gradients that depend on each other would
-    then wander, and miss all levels by rounding of one sign. So the amount by which a function rises or falls is left
-    open there: it changes as the others determine, or not at all if that change has the wrong sign.
+    the production, the levels may have no common point. Corrections along linearly dependent gradients would then
+    not converge, and the rounding errors on all levels would have one sign. So such a function has no prescribed
+    change: it changes as the others determine, or not at all if that change has the wrong sign.
     """
     discrete_gradient, surface, clock = CHANGE_GRADIENT, system.constraint_surface, system.clock
     work_direction = None if clock is None else clock.work_direction(system.dim)

@@ -193,7 +193,7 @@ def several(
     ----------
     build : function from a seed to a system
         Such as ``lambda seed: lt.learn.Metriplectic(4, seed=seed)``.
-    data, how
+    data, fit_options
         As for :func:`fit`.
     number : int
         Number of fits.

@@ -180,7 +180,13 @@ def _gradient_jitted(function: Callable, x) -> jax.Array:
 
 
 class Entropy(Energy):
-    """A learned entropy: :class:`Energy` with another default seed of the initial weights."""
+    """A learned entropy: :class:`Energy` with another default seed of the initial weights.
+
+    Parameters
+    ----------
+    function, width, depth, seed : int or callable, int, int, int
+        As for :class:`Energy`; the default seed is 1.
+    """
 
     def __init__(self, function: int | Callable, width: int = 32, depth: int = 2, seed: int = 1):
         super().__init__(function, width, depth, seed)

@@ -414,7 +414,9 @@ def _columns_of_dataframe(frame) -> dict[str, np.ndarray]:
     """Return the columns and named indices of a DataFrame as arrays, by name; raise InputError if names are equal."""
     columns = {str(name).strip(): _series_to_array(frame[name]) for name in frame.columns}
     if len(columns) < len(frame.columns):
-        raise InputError(f"the table has several columns of one name: {', '.join(map(str, frame.columns))}")
+        raise InputError(
+            f"the columns of the table must have different names, got {', '.join(map(str, frame.columns))}"
+        )
     for name in frame.index.names:
         if name is not None and name not in columns:
             columns[str(name)] = np.asarray(frame.index.get_level_values(name))

@@ -30,8 +30,7 @@ from .joint_states import (
 
 
 class BodiesOnGround(TreeSystem, TorqueSystem):
-    """A tree of jointed rigid bodies on the ground, such as pendulums and arms, on ``T*Q``; :meth:`Tree.system` builds
-    it.
+    """Jointed rigid bodies on the ground, such as pendulums and arms, on ``T*Q``; :meth:`Tree.system` builds them.
 
     ``q' = dH/dp``, ``p' = -dH/dq - c q' + u``, ``T y' = sum c q'**2`` with ``H = p . M(q)^-1 p / 2 + V(q)``. V is the
     energy of the springs and of the weights in a uniform field of gravity, and u are the torques of motors. The state
@@ -40,6 +39,20 @@ class BodiesOnGround(TreeSystem, TorqueSystem):
     Attributes
     ----------
     motors : JointMotors or None
+        Motors of the joints.
+
+    Examples
+    --------
+    A pendulum that hangs from the ceiling:
+
+    >>> tree = lt.bodies.Tree(ground="ceiling")
+    >>> hinge = lt.bodies.Hinge(at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+    >>> bob = tree.add(
+    ...     "bob", mass=1.0, centre=(0.0, 0.0, -0.5), parent="ceiling", joint=hinge
+    ... )
+    >>> pendulum = tree.system(gravity=(0.0, 0.0, -9.81))
+    >>> pendulum.state(joints={"bob": 0.3}).shape
+    (2,)
     """
 
     motors: JointMotors | None

@@ -87,9 +87,9 @@ def body_with_wheels(
         those of the wheels: see :mod:`liethermo.torques`. The state then has the work, the heat and the time behind S.
         Torques that depend on the attitude need ``attitude=True``.
     attitude : bool
-        If true, runs follow the attitude of the body, an element of SO(3). The same equations are then those of
-        :func:`reaction_wheels`, in the state (L, p, y): the angular momentum L of the whole in body axes, those of the
-        wheels, ``p_i = J_i (Omega_i + w_i)``, and the entropy y of the bath, whose energy is ``C (T - T_0)``.
+        If true, runs follow the attitude of the body, an element of SO(3). The system is then the one of
+        :func:`reaction_wheels`, with the state (L, p, y): the angular momentum L of the whole in body axes, the momenta
+        of the wheels, ``p_i = J_i (Omega_i + w_i)``, and the entropy y of the bath, whose energy is ``C (T - T_0)``.
 
     Raises
     ------

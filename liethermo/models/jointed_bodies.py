@@ -50,9 +50,8 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
 
     Attributes
     ----------
-    motors : JointMotors or None
-    orbit : Orbit or None
-        Orbit on which the gradient of gravity acts.
+    motors, orbit : JointMotors or None, Orbit or None
+        The motors of the joints, and the orbit along which the gradient of gravity acts.
     """
 
     motors: JointMotors | None
@@ -165,7 +164,7 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         start = self._centre_of_mass_index
         if start is None:
             raise InputError(
-                "the tree has no position: build it by tree.system(gravity=(0, 0, 0)), or in another field"
+                "the tree has no position. Build it by tree.system(gravity=(0, 0, 0)), or with another uniform field"
             )
         return self.state(x, batch=True)[..., start : start + 3]
 
@@ -207,27 +206,21 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
 
         Parameters
         ----------
-        x : array, shape (n,), optional
+        x, batch : array, shape (n,), or (..., n) with ``batch=True``; optional
             The state, with or without the entropy of the bath, instead of all other arguments.
-        batch : bool
-            Allow x to be many states, shape (..., n).
         angular_velocity : array, shape (3,) or (B, 3), optional
             Angular velocity of the base, in its axes (rad/s); zero by default.
         momentum : array, shape (3,) or (B, 3), optional
             Angular momentum of the whole about its centre of mass, in axes of the base (kg m**2 / s), instead of the
             angular velocity.
-        joints : dict of float, or of array, shape (B,); optional
-            Joint coordinates (rad, or m) by the name of the body; two of a universal joint, shape (2,) or (B, 2). Those
-            left out are zero.
-        joint_rates : dict, as ``joints``; optional
-            Rates of the joint coordinates (rad/s, or m/s); those left out are zero.
+        joints, joint_rates : dict of float, or of array, shape (B,); optional
+            Joint coordinates (rad, or m) and their rates (rad/s, or m/s) by the name of the body; two of a universal
+            joint, shape (2,) or (B, 2). Those left out are zero.
         centre_of_mass, velocity : array, shape (3,) or (B, 3), optional
-            Position (m) and velocity (m/s) of the common centre of mass in axes in space, of a tree in a uniform field
+            Position (m) and velocity (m/s) of the common centre of mass in axes in space, for a tree in a uniform field
             of gravity; zero by default.
-        temperature : float, or array, shape (B, 1); optional
-            Temperature of the bath; by default that at zero entropy.
-        degrees : bool
-            If true, the angular velocity, joint angles and their rates are in degrees and degrees/s.
+        temperature, degrees : float, or array, shape (B, 1); bool; optional
+            Temperature of the bath, by default that at zero entropy; and whether angles and rates are in degrees.
 
         Returns
         -------
@@ -271,8 +264,8 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         if self._centre_of_mass_index is None:
             if centre_of_mass is not None or velocity is not None:
                 raise InputError(
-                    "centre_of_mass= and velocity= are for a tree with a position: build it by "
-                    "tree.system(gravity=(0, 0, 0)), or in another uniform field"
+                    "centre_of_mass= and velocity= need a tree with a position. Build it by "
+                    "tree.system(gravity=(0, 0, 0)), or with another uniform field"
                 )
             return ()
         values = {"centre_of_mass": centre_of_mass, "velocity": velocity}

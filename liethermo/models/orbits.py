@@ -20,7 +20,7 @@ MAX_PERPENDICULAR_COSINE = 1e-8
 """Largest cosine of two directions that count as perpendicular."""
 
 KEPLER_ITERATIONS = 6
-"""Steps of Danby's iteration for Kepler's equation, of order 4. Five reach rounding for e <= 0.999; one is spare."""
+"""Steps of Danby's iteration for Kepler's equation, of order 4. Five are enough for e <= 0.999, one is a reserve."""
 
 
 class Orbit(Module):

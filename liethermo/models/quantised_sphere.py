@@ -204,7 +204,7 @@ class QuantisedSphere:
             raise InputError(f"vorticity must be anti-Hermitian, but W + W^H is {skew:.3g} of its norm")
         if not trace <= TRACE_RTOL:
             raise InputError(
-                f"the vorticity has a trace of {trace:.3g} of its norm: its integral over the sphere has to vanish. "
+                f"the vorticity has a trace of {trace:.3g} of its norm: its integral over the sphere must be 0. "
                 "Subtract np.trace(W) / N from its diagonal"
             )
         return self.algebra.from_dual_matrix(W)

@@ -86,6 +86,11 @@ def toda_flow(n: int) -> LiePoissonSystem:
 def hermitian_state(L) -> jax.Array:
     """Return the state of a Hermitian matrix, shape (n, n), on the dual of u(n), shape (n**2,).
 
+    Parameters
+    ----------
+    L : array, shape (n, n)
+        A Hermitian matrix.
+
     Raises
     ------
     InputError
@@ -100,7 +105,13 @@ def hermitian_state(L) -> jax.Array:
 
 def hermitian_matrix(x) -> jax.Array:
     """Return the Hermitian matrices of states, shape (..., n**2) to (..., n, n): the inverse of
-    :func:`hermitian_state`."""
+    :func:`hermitian_state`.
+
+    Parameters
+    ----------
+    x : array, shape (..., n**2)
+        States of a flow on the dual of u(n).
+    """
     state = jnp.asarray(x)
     algebra = mf.u(round(state.shape[-1] ** 0.5))
     return -1j * jnp.einsum("...a,aij->...ij", state / _squared_norms(algebra), algebra.basis)

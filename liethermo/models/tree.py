@@ -62,7 +62,7 @@ class Tree(metaclass=ListedType):
 
     Examples
     --------
-    A satellite with a panel on a hinge with a spring and a damper:
+    A satellite with a panel on a hinge with a spring and a damper (a pendulum: :class:`BodiesOnGround`):
 
     >>> tree = lt.bodies.Tree()
     >>> bus = tree.add("bus", mass=10.0, inertia=(3.0, 2.0, 1.5))
@@ -82,17 +82,6 @@ class Tree(metaclass=ListedType):
     >>> solution = lt.integrate(system, x0, (0.0, 10.0), 0.05, lt.MetriplecticGauss(2))
     >>> solution.audit().passed, solution.joints["panel"].shape
     (True, (201,))
-
-    A pendulum that hangs from the ground:
-
-    >>> tree = lt.bodies.Tree(ground="ceiling")
-    >>> hinge = lt.bodies.Hinge(at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
-    >>> bob = tree.add(
-    ...     "bob", mass=1.0, centre=(0.0, 0.0, -0.5), parent="ceiling", joint=hinge
-    ... )
-    >>> pendulum = tree.system(gravity=(0.0, 0.0, -9.81))
-    >>> pendulum.state(joints={"bob": 0.3}).shape
-    (2,)
     """
 
     def __init__(self, ground: str | None = None) -> None:
@@ -111,14 +100,12 @@ class Tree(metaclass=ListedType):
         parent: str | None = None,
         joint: Joint | None = None,
     ) -> str:
-        """Add a body; the first one is the base, and each later one needs a parent and a joint.
+        """Add a body and return its name; the first is the base, and each later one needs a parent and a joint.
 
         Parameters
         ----------
-        name : str
-            Name of the body, and of its joint.
-        mass : float, > 0
-            Mass (kg).
+        name, mass : str, and float > 0
+            Name of the body and of its joint, and its mass (kg).
         centre : array, shape (3,)
             Centre of mass in axes of the body, from its origin (m).
         inertia : array, shape (3,) or (3, 3)
@@ -128,11 +115,6 @@ class Tree(metaclass=ListedType):
             Name of a body that was added before.
         joint : Hinge, Slider or Universal
             The joint between the parent and this body.
-
-        Returns
-        -------
-        str
-            The name, to be the parent of other bodies.
 
         Raises
         ------
@@ -172,7 +154,7 @@ class Tree(metaclass=ListedType):
     def base(self) -> str:
         """Name of the base."""
         if not self._bodies:
-            raise InputError("the tree has no bodies: add a base first")
+            raise InputError("the tree has no bodies. Add a base first")
         return next(iter(self._bodies))
 
     def __repr__(self) -> str:
@@ -273,7 +255,8 @@ class Tree(metaclass=ListedType):
         ...   <link name="bus"><inertial><mass value="10"/>
         ...     <inertia ixx="3" iyy="2" izz="1.5" ixy="0" ixz="0" iyz="0"/></inertial></link>
         ...   <link name="panel"><inertial><origin xyz="0.8 0 0"/><mass value="2"/>
-        ...     <inertia ixx="0.05" iyy="0.4" izz="0.42" ixy="0" ixz="0" iyz="0"/></inertial></link>
+        ...     <inertia ixx="0.05" iyy="0.4" izz="0.42" ixy="0" ixz="0" iyz="0"/>
+        ...   </inertial></link>
         ...   <joint name="hinge" type="continuous"><parent link="bus"/><child link="panel"/>
         ...     <origin xyz="0.5 0 0"/><axis xyz="0 1 0"/><dynamics damping="0.3"/></joint>
         ... </robot>''')
@@ -307,8 +290,10 @@ class Tree(metaclass=ListedType):
         Examples
         --------
         >>> tree = lt.bodies.Tree.from_mjcf('''<mujoco><option gravity="0 0 0"/><worldbody>
-        ...   <body name="bus"><freejoint/><inertial pos="0 0 0" mass="10" diaginertia="3 2 1.5"/>
-        ...     <body name="panel" pos="0.5 0 0"><joint type="hinge" axis="0 1 0" damping="0.3"/>
+        ...   <body name="bus"><freejoint/>
+        ...     <inertial pos="0 0 0" mass="10" diaginertia="3 2 1.5"/>
+        ...     <body name="panel" pos="0.5 0 0">
+        ...       <joint type="hinge" axis="0 1 0" damping="0.3"/>
         ...       <inertial pos="0.8 0 0" mass="2" diaginertia="0.05 0.4 0.42"/></body></body>
         ... </worldbody></mujoco>''')
         >>> tree.names

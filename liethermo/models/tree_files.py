@@ -513,7 +513,7 @@ def _make_joint(group: _RigidLinkGroup) -> Joint:
         return Universal(group.at, axes, stiffness, damping, rests)
     kinds = " and ".join("slide" if joint.slides else "hinge" for joint in joints)
     raise InputError(
-        f"the joints {kinds} together are not covered. The combinations that are: one hinge, one slide, two hinges"
+        f"a body with the joints {kinds} is not covered. A body may have one hinge, one slide or two hinges"
     )
 
 

@@ -89,12 +89,10 @@ class Ensemble(AuditableResult):
         ``max |H - H0|`` over every step, relative to the rounding scale of H: as for :class:`Audit`.
     largest_energy_increment, least_entropy_increment : ndarray, shape (B,)
         Extreme increments in one step, over every step.
-    entropy_scale : ndarray, shape (B,)
-        ``max(|S(0)|, |S(T)|)``.
     energy_sensitivity, entropy_sensitivity : ndarray, shape (B,)
         Largest :meth:`liethermo.Energy.sensitivity` over every step, relative to which rounding is judged.
-    first_energy, entropy_change : ndarray, shape (B,)
-        ``H(0)`` and ``S(T) - S(0)``.
+    first_energy, entropy_change, entropy_scale : ndarray, shape (B,)
+        ``H(0)``, ``S(T) - S(0)`` and ``max(|S(0)|, |S(T)|)``.
     relaxation_time : ndarray, shape (B,)
         ``int_0^T (S(T) - S(t)) dt / (S(T) - S(0))``, T the end of the trajectory: the time constant of an exponential
         relaxation that is over by T. Under a double bracket the energy replaces S. NaN if nothing relaxes.
@@ -110,12 +108,9 @@ class Ensemble(AuditableResult):
         Work done on the system from outside, if its energy depends on time; the drift and the increments of the energy
         are then those of the energy less the work.
     events : Events
-        The events of each function of ``until``: ``e.events[k]`` has times ``t``, states ``x`` and numbers
-        ``trajectory``.
-    reasons : mapping from int to str
-        Why trajectories are inadmissible, or have failed.
-    provenance : dict
-        Library version, method, step, system, date: JSON data.
+        The events of each function of ``until``: ``e.events[k]`` has times ``t``, states ``x``, numbers ``trajectory``.
+    reasons, provenance : mapping from int to str, dict
+        Why trajectories are inadmissible or have failed; JSON data: library version, method, step, system, date.
     """
 
     state_fields = ("x", "x0")
@@ -191,7 +186,7 @@ class Ensemble(AuditableResult):
         """
         i = self._checked_member_index(i)
         if self.x is None:
-            raise InputError('no states were kept: run the ensemble with outputs="final" or "trajectory"')
+            raise InputError('no states were kept. Run the ensemble with outputs="final" or "trajectory"')
         if self.status[i] == StatusCode.INADMISSIBLE:
             raise InputError(self.message(i))
         return self.member_solution(i) if self.solution_builder is None else self.solution_builder(self, i)
@@ -315,17 +310,13 @@ class Ensemble(AuditableResult):
 
         Steps are examined along at most 32 trajectories (with adaptive steps, the first of each). Conserved
         functions, and conditions such as the positivity of density matrices, are evaluated at the saved states of these
-        trajectories. If not all steps were checked, the verdict says how many.
+        trajectories. If not all steps were checked, the verdict says how many. InputError if the name of a tolerance is
+        unknown, or a tolerance is negative.
 
         Parameters
         ----------
         energy, entropy, casimirs, residual, accuracy, consistency : float
             Tolerances: see :class:`liethermo.results.audit.Tolerances`.
-
-        Raises
-        ------
-        InputError
-            If the name of a tolerance is unknown, or a tolerance is negative.
         """
         limits = Tolerances.with_defaults(energy=energy, entropy=entropy, **tolerances)
         has_stepped, drifts = self.steps > 0, self.evidence.drifts

@@ -135,17 +135,14 @@ class SaveableResult(metaclass=ListedABCMeta):
     def save(self, path: str | os.PathLike, units: Mapping[str, str] | None = None) -> Path:
         """Write a NetCDF file, which :func:`load` reads; it is complete or does not appear at all.
 
+        FileError if the file cannot be written, InputError if a name in ``units`` has no variable.
+
         Parameters
         ----------
         path : path
             The file to write.
         units : dict of str, optional
             Units by the name of a variable: see :meth:`to_xarray`.
-
-        Raises
-        ------
-        FileError, InputError
-            If the file cannot be written, or a name in ``units`` has no variable.
         """
         return write_dataset(self.to_xarray(units), path)
 
@@ -209,7 +206,7 @@ def read_variables_and_attributes(path: str | os.PathLike) -> tuple[dict[str, np
             f"{path} is not a liethermo result: the format of this NetCDF file is {attributes.get('format')!r}"
         )
     if attributes["format"] in FORMATS_WITHOUT_CHECKSUM:
-        warn(f"{path} has no checksum, as an earlier version wrote it: damage would not show")
+        warn(f"{path} was written by an earlier version, without a checksum, so damage cannot be detected")
     elif attributes.get("sha256") != checksum(series, attributes):
         raise FileError(f"{path} is damaged: its content does not have the checksum that it was written with")
     return series, attributes
@@ -218,8 +215,8 @@ def read_variables_and_attributes(path: str | os.PathLike) -> tuple[dict[str, np
 def _check_file_digest(path: Path) -> None:
     """Raise FileError if the digest after the end of a file does not fit, before HDF5 opens it.
 
-    A damaged file can keep the reader of HDF5 in an endless loop. A file without a digest is let through: programs that
-    write to an HDF5 file may cut off what follows its end.
+    A damaged file can keep the reader of HDF5 in an endless loop. A file without a digest is accepted, because
+    programs that write to an HDF5 file may cut off the bytes after its end.
     """
     tag_length = len(CHECKSUM_TAG) + 2 * hashlib.sha256().digest_size
     content_length = path.stat().st_size - tag_length

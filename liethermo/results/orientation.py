@@ -32,7 +32,7 @@ def quaternions(solution: AuditableResult, scalar: Literal["last", "first"] = "l
 
     Returns
     -------
-    ndarray, shape (times, 4), or (B, times, 4) of an ensemble of trajectories, (B, 4) of one of final states
+    ndarray, shape (times, 4); of an ensemble (B, times, 4), or (B, 4) if it has final states only
 
     Raises
     ------
@@ -93,7 +93,7 @@ def euler_angles(solution: AuditableResult, sequence: str = "zyx", degrees: bool
 
     Returns
     -------
-    ndarray, shape (times, 3), or (B, times, 3) of an ensemble of trajectories, (B, 3) of one of final states
+    ndarray, shape (times, 3); of an ensemble (B, times, 3), or (B, 3) if it has final states only
         Angles (rad, or degrees) in the order of the letters. The first and the last are from -pi to pi, the middle one
         from -pi/2 to pi/2, or from 0 to pi if the first and last letter are the same. In gimbal lock, where only the
         sum or difference of two angles is defined, the last is 0.
@@ -133,7 +133,7 @@ def angular_velocity(
 
     Returns
     -------
-    ndarray, shape (times, 3), or (B, times, 3) of an ensemble of trajectories, (B, 3) of one of final states
+    ndarray, shape (times, 3); of an ensemble (B, times, 3), or (B, 3) if it has final states only
 
     Raises
     ------
@@ -180,7 +180,7 @@ def rotor_rates(solution: AuditableResult, degrees: bool = False) -> np.ndarray:
 def _require_velocities(solution: AuditableResult, velocity_name: str, absence_message: str) -> np.ndarray:
     """Return velocities at the saved states of a result; raise InputError with ``absence_message`` if it has none."""
     if solution.x is None:
-        raise InputError('no states were kept: run the ensemble with outputs="final" or "trajectory"')
+        raise InputError('no states were kept. Run the ensemble with outputs="final" or "trajectory"')
     if velocity_name not in solution.velocity_sources:
         raise InputError(f"the result has {absence_message}")
     return solution.velocity_sources[velocity_name]()
@@ -241,7 +241,7 @@ def angular_momentum(solution: AuditableResult, frame: Literal["body", "space"] 
 
     Returns
     -------
-    ndarray, shape (times, 3), or (B, times, 3) of an ensemble of trajectories, (B, 3) of one of final states
+    ndarray, shape (times, 3); of an ensemble (B, times, 3), or (B, 3) if it has final states only
         Momenta (mass * length**2 / time).
 
     Raises
@@ -284,7 +284,7 @@ def nutation(solution: AuditableResult, axis=None, degrees: bool = False) -> np.
 
     Returns
     -------
-    ndarray, shape (times,), or (B, times) of an ensemble of trajectories, (B,) of one of final states
+    ndarray, shape (times,); of an ensemble (B, times), or (B,) if it has final states only
         Angles.
 
     Raises
@@ -408,7 +408,7 @@ def _require_rotation_matrices(solution: AuditableResult) -> np.ndarray:
 def _require_angular_momenta(solution: AuditableResult) -> np.ndarray:
     """Return the first three components of the states, shape (..., 3); raise InputError unless these are on so(3)*."""
     if solution.x is None:
-        raise InputError('no states were kept: run the ensemble with outputs="final" or "trajectory"')
+        raise InputError('no states were kept. Run the ensemble with outputs="final" or "trajectory"')
     if not str(solution.provenance.get("algebra", "")).startswith("so(3)"):
         raise InputError(
             f"the state must begin with an angular momentum on so(3)*, but the algebra of this system is "

@@ -210,12 +210,8 @@ class Solution(AuditableResult):
         Entropy at these times; None for a system without one.
     casimirs : dict of ndarray, shape (times,)
         Casimirs, momentum maps and preserved functions along the run, by name.
-    status : Status
-        How the run ended.
-    stats : Stats
-        Numbers of steps and iterations.
-    laws : Laws
-        The laws that the audit checks.
+    status, stats, laws : Status, Stats, Laws
+        How the run ended, the numbers of steps and iterations, and the laws that the audit checks.
     provenance : dict
         Library version, method, step, system, date, spec: JSON data.
     event_time : float or None
@@ -267,7 +263,7 @@ class Solution(AuditableResult):
             Unless the run was made with ``dense=True`` and covers the times.
         """
         if self.dense is None:
-            raise InputError("this solution has no dense output; ask for it with integrate(..., dense=True)")
+            raise InputError("this solution has no dense output. Run integrate(..., dense=True)")
         states = self.dense(t)
         return states.reshape(*states.shape[:-1], *self.x.shape[1:])
 
@@ -281,17 +277,13 @@ class Solution(AuditableResult):
         """Audit the run: judge whether the laws held and the steps resolve the motion, as a table.
 
         The first call examines the steps: all of them in runs of ordinary length, otherwise those where the motion is
-        fastest, and the verdict then says how many. It computes the worst of them again.
+        fastest, and the verdict then says how many. It computes the worst of them again. InputError if the name of a
+        tolerance is unknown, or a tolerance is negative.
 
         Parameters
         ----------
         energy, entropy, casimirs, residual, attitude, accuracy, consistency : float
             Tolerance of each, relative (dimensionless): see :class:`liethermo.results.audit.Tolerances`.
-
-        Raises
-        ------
-        InputError
-            If the name of a tolerance is unknown, or a tolerance is negative.
 
         Examples
         --------

@@ -193,8 +193,7 @@ class Fluctuations(metaclass=ListedType):
 
         The rows test ``B B^T = K``, then ``B^T grad H = 0``, then that columns of B declared divergence-free are so.
         The last row does not pass or fail: it is the rate at which the motion changes volume, or the measure of
-        ``density``. If it is
-        not zero, the states tend to another measure than the one in the description of the class.
+        ``density``. If it is not zero, the states tend to another measure than the one in the description of the class.
         """
         self.method_with_noise(system, DEFAULT_NOISE_METHOD)
         points = system.samples(samples, seed, scale)

@@ -38,6 +38,11 @@ def store_status(store: StudyStore) -> StudyStatus:
 def load_study(path: Any) -> xarray.Dataset:
     """Return the results in the store of a :class:`Study`, which may be running; values are read on access.
 
+    Parameters
+    ----------
+    path : path
+        The folder of the store.
+
     Raises
     ------
     FileError

@@ -80,13 +80,10 @@ class Study(metaclass=ListedType):
         the time at which the rate is below ``tol``, where the run ends too, ``lt.At(times)``, or any function from a
         :class:`Solution` to a number or an array.
     store : path, optional
-        Folder of the results. Without one they are kept in a temporary folder as long as this object, or an array of
-        its results, exists.
-    attitude : array, shape (m, m), or function from the dict of a point to one, optional
-        As for :func:`integrate` (dimensionless).
-    noise : Fluctuations, optional
-        As for :func:`integrate`. The seed of a point depends only on that of the noise and on its place on the axes.
-        Chunks, workers and longer axes do not change it.
+        Folder of the results; by default a temporary one, for as long as this object or an array of its results exists.
+    attitude, noise : array, shape (m, m), or function from the dict of a point to one; Fluctuations; optional
+        As for :func:`integrate` (dimensionless attitudes). The seed of a point depends only on the seed of the noise
+        and on its place on the axes. Chunks, workers and longer axes do not change it.
     chunk : int, optional
         The approximate number of points of a chunk. A chunk is in memory at once, and is lost if a run is killed.
     units, names : dict from str to str, optional
@@ -247,10 +244,7 @@ class Study(metaclass=ListedType):
     def status(self) -> StudyStatus:
         """Return the progress of the study from its store, also while another process runs it.
 
-        Raises
-        ------
-        FileError
-            If there is no store.
+        FileError if there is no store.
         """
         return load_status(self.store)
 
@@ -277,15 +271,12 @@ class Study(metaclass=ListedType):
     def audit(self, **tolerances: float) -> Audit:
         """Audit the laws over all finished points, each law by its worst point; printing the result gives a table.
 
+        FileError if there is no store, InputError if a tolerance has an unknown name or is negative.
+
         Parameters
         ----------
         energy, entropy, casimirs, residual : float
             Tolerances: see :class:`liethermo.results.audit.Tolerances`.
-
-        Raises
-        ------
-        FileError, InputError
-            If there is no store, or a tolerance has an unknown name or is negative.
         """
         return audit_store(self.store, **tolerances)
 

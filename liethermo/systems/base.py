@@ -304,11 +304,7 @@ class System(SystemInterface):
         """Return ``x`` as a checked state: real doubles, finite, shape (n,), or (..., n) with ``batch``.
 
         For a system on sites x may have the shape ``(*sites, d)``. On a manifold x may have the shape of points,
-        and must be a point of it.
-
-        Raises
-        ------
-        InputError, manifolds.OffManifoldError
+        and must be a point of it. InputError or manifolds.OffManifoldError if it is no state.
         """
         numbers = self.state_array(x, batch)
         return numbers.astype(jnp.float64) if isinstance(numbers, jax.core.Tracer) else real_array(numbers)

@@ -44,7 +44,7 @@ def is_state_given_by_velocity(system, x, angular_velocity, alternative: str, **
         if x is None:
             raise InputError("state needs x or angular_velocity=")
         if names := [f"{name}=" for name, value in velocity_arguments.items() if value is not None]:
-            raise InputError(f"{' and '.join(names)} of a state needs angular_velocity=, not x")
+            raise InputError(f"{' and '.join(names)} cannot be combined with x. Give angular_velocity= instead of x")
         return False
     if x is not None:
         raise InputError("state needs x or angular_velocity=, got both")

@@ -221,10 +221,8 @@ class EulerPoincareClosedSystem(LedgerSystem):
         f, with ``f . xi <= 0``. A coefficient R means ``f = -R xi``, as of :class:`liethermo.SimpleClosedSystem`: a
         number, an array of shape (dim,) for a diagonal matrix, or (dim, dim), whose symmetric part is positive
         semidefinite.
-    external : function of the same arguments, or an array of shape (dim,); optional
-        F, in the frame of the body.
-    heat_power : function of the same arguments to a scalar, or a number; optional
-        P_H, the heat received per time (power).
+    external, heat_power : functions of the same arguments, or an array, shape (dim,), and a number; optional
+        F, in the frame of the body, and P_H, the heat received per time (power).
     momentum_maps, validate
         As for :class:`System`; functions of (xi, S).
 

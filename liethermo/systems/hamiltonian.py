@@ -250,9 +250,8 @@ def join_baths(first_baths: HeatBaths, second_baths: HeatBaths) -> HeatBaths:
 class RotatingFrame(metaclass=ListedType):
     """A frame that turns by ``exp(-i G t)``: its density matrices are ``exp(i G t) rho exp(-i G t)`` (hbar = 1).
 
-    There the Hamiltonian is ``exp(i G t) H(t) exp(-i G t) - G``. It is constant for a drive that turns with G. A linear
-    drive, ``H0 + cos(omega t) D``, leaves terms that oscillate at ``2 omega``; the rotating-wave approximation drops
-    them.
+    In the frame the Hamiltonian is ``exp(i G t) H(t) exp(-i G t) - G``, constant if a drive turns with G. A linear
+    drive, ``H0 + cos(omega t) D``, leaves terms at the frequency 2 omega; the rotating-wave approximation drops them.
 
     Parameters
     ----------

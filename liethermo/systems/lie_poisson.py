@@ -49,8 +49,7 @@ class LiePoissonSystem(TorqueSystem):
     algebra : manifolds.LieAlgebra
         The Lie algebra g. Its structure constants are numbers without a unit.
     energy : function from mu, shape ``algebra.shape``, to a scalar, or an Energy
-        H, or a function of mu and the time t: see :class:`liethermo.TimeDependent`. It fixes the units: that of H over
-        that of mu is 1 / time.
+        H, or a function of mu and t (:class:`liethermo.TimeDependent`). The unit of H over that of mu is 1 / time.
     entropy : function from mu to a scalar, or an Energy; optional
         S, a Casimir function of the algebra (checked), in any unit of entropy, or dimensionless.
     dissipation : Dissipation, or a list of them that act together; optional
@@ -72,10 +71,9 @@ class LiePoissonSystem(TorqueSystem):
         by the entropies of the baths (energy / temperature), which are zero if they are left out.
     torque : function of (t, mu), (t, mu, attitude) or (t, mu, attitude, velocity), or a list of them; optional
         An external torque, ``mu' = ad*_xi mu + torque``: a dual vector of the shape of mu (energy, if xi is 1 / time).
-        The attitude has shape (m, m); the velocity is ``dH/dmu``, of the shape of mu, for torques such as drag.
-        The torque does the work W, ``W' = xi . torque``; the energy less the work is constant, the Casimirs are not.
-        Momentum maps must be conserved by the torque too. The arrays of an ``equinox.Module`` are parameters, such as
-        ``"torque.moment"``. ``lt.torques`` has ready ones.
+        ``lt.torques`` has ready ones. The attitude has shape (m, m); the velocity is ``dH/dmu``, for drag. The torque
+        does the work W, ``W' = xi . torque``: the energy less W is constant, and Casimirs are not. It must conserve the
+        momentum maps. The arrays of an ``equinox.Module`` are parameters, such as ``"torque.moment"``.
 
     Raises
     ------
@@ -84,15 +82,13 @@ class LiePoissonSystem(TorqueSystem):
 
     Examples
     --------
+    >>> energy = lambda mu: 0.5 * jnp.sum(mu**2 / jnp.array([3.0, 2.0, 1.0]))
+    >>> friction, baths = lt.DoubleBracket(rate=0.08), lt.HeatBaths(capacity=2.0)
     >>> system = lt.LiePoissonSystem(
-    ...     mf.so(3),
-    ...     energy=lambda mu: 0.5 * jnp.sum(mu**2 / jnp.array([3.0, 2.0, 1.0])),
-    ...     dissipation=lt.DoubleBracket(rate=0.08),
-    ...     baths=lt.HeatBaths(capacity=2.0),
-    ...     group=mf.SO(3),
+    ...     mf.so(3), energy, dissipation=friction, baths=baths, group=mf.SO(3)
     ... )
-    >>> system.dim, bool(system.check().passed)
-    (4, True)
+    >>> system.state(angular_velocity=(0.1, 0.2, 0.5)).shape, bool(system.check().passed)
+    ((4,), True)
     """
 
     algebra: mf.LieAlgebra = eqx.field(static=True)
@@ -183,16 +179,8 @@ class LiePoissonSystem(TorqueSystem):
             Omega in body axes (rad / time), instead of x. The momentum is the one at which ``dH/dmu = (Omega, w)``.
         rotor_rates : array, shape (k,), or (..., k) with ``batch``; optional
             w, the rates of rotors relative to the body (rad / time), or other velocities; zero by default.
-        temperature : float, or array, shape (baths,); optional
-            Temperatures of the baths; by default those at zero entropy.
-        t : float, optional
-            The time, if the energy depends on it.
-
-        Examples
-        --------
-        >>> body = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.1)
-        >>> body.state(angular_velocity=(0.1, 0.2, 0.3), temperature=1.0).tolist()
-        [0.30000000000000004, 0.4, 0.3, 0.0]
+        temperature, t : float, or array, shape (baths,), and float; optional
+            Temperatures of the baths, by default those at zero entropy, and the time, if the energy depends on it.
         """
         details = {"rotor_rates": rotor_rates, "temperature": temperature, "degrees": degrees or None}
         if not is_state_given_by_velocity(self, x, angular_velocity, "momentum", **details):

@@ -95,7 +95,7 @@ class MetriplecticSystem(System):
         if not isinstance(poisson, mf.PoissonStructure):
             poisson = mf.PoissonTensor(poisson, dim) if poisson is not None else mf.NoPoisson(dim)  # type: ignore[arg-type]
         if poisson.dim is None:
-            raise InputError("the Poisson structure does not say how many coordinates it has. Give it its dimension")
+            raise InputError("the dimension of the Poisson structure is unknown. Give its dim=")
         if space is not None and poisson.dim != space.size:
             raise InputError(
                 f"the Poisson structure must have {space.size} coordinates, one for each real component of a point of "

@@ -74,8 +74,8 @@ class QuantumSystem(System):
     ----------
     hamiltonian : array, shape (N, N), function from t to one, or list of terms
         H, Hermitian (energy; hbar = 1, so the unit of time is 1 / energy). It may be a ``Qobj`` of QuTiP. A term is a
-        matrix, or a pair of a matrix and a real function of t: ``[H0, [H1, f]]`` is ``H0 + f(t) H1``, as in QuTiP. The
-        function may be an array of its values at ``times``. A string is not evaluated.
+        matrix, or a pair of a matrix and a real function of t, or of its values at ``times``: ``[H0, [H1, f]]`` is
+        ``H0 + f(t) H1``, as in QuTiP. A string is not evaluated.
     dissipation : ThermalJumps, SteepestEntropyAscent, LindbladJumps, or a list of them; optional
         The part of the motion that produces entropy, or Lindblad's equation without such a promise.
     baths : HeatBaths, optional
@@ -83,27 +83,23 @@ class QuantumSystem(System):
         ``HeatBaths(capacity=np.inf, temperature=T)`` keeps its temperature.
     entropy : VonNeumann, optional
         The entropy of rho (dimensionless, k_B = 1), with a floor for eigenvalues near zero; by default without one.
-    parts : sequence of int, optional
-        The dimensions of the factors of which this system is the product.
-    names : sequence of str, optional
-        The names of these factors.
+    parts, names : sequence of int, sequence of str; optional
+        The dimensions and the names of the factors of which this system is the product.
     validate : bool
         Test the axioms at a few random points. They hold by form, whatever matrices are given.
     times : array, shape (points,), optional
-        Increasing times (1 / energy) of the values of coefficients that are arrays, between which a cubic spline
-        interpolates. Runs beyond the first or the last of them are refused.
+        Increasing times (1 / energy) of coefficients that are arrays, for a cubic spline. A run must stay within them.
 
     Raises
     ------
     InputError, AxiomError
+        If an argument does not fit, or (with ``validate``) an axiom fails.
 
     Attributes
     ----------
     structure : manifolds.DensityMatrices
-    floor : float
-        Eigenvalues of rho up to this have no part in the entropy.
-    time : array, shape (), or None
-        The time at which rates that depend on it are taken: see :meth:`at_time`.
+    floor, time : float, and array, shape (), or None
+        Eigenvalues of rho up to ``floor`` have no part in the entropy. Rates that depend on time are taken at ``time``.
 
     Examples
     --------
@@ -186,21 +182,17 @@ class QuantumSystem(System):
     def state(self, rho, batch: bool = False, entropies=None, mixed: float = 0.0) -> jax.Array:
         """Return the state, shape (..., n), of density matrices, shape (..., N, N), or of pure states.
 
+        InputError if rho is no density matrix, or the shape of the entropies does not fit.
+
         Parameters
         ----------
         rho : array, shape (..., N, N), or a state already
             Hermitian, positive, of trace one. Or the amplitudes of a pure state, shape (N,) or (..., N, 1). A ``Qobj``
             of QuTiP may be a ket, a bra, an operator, or a stacked operator or its adjoint.
-        batch : bool
-            Whether states that are given as such may be several.
-        entropies : array, shape (..., number of baths), optional
-            Those of the baths; by default zero.
+        batch, entropies : bool, and array, shape (..., number of baths); optional
+            Whether an array of real states may have leading axes; the entropies of the baths, by default zero.
         mixed : float
             Share of the identity that it is mixed with: a pure state has an infinite gradient of the entropy.
-
-        Raises
-        ------
-        InputError
         """
         rho = self._array_of_qobj(rho)
         if isinstance(rho, jax.core.Tracer) or (

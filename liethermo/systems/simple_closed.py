@@ -37,13 +37,13 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
     The state is (q, v, S), shape (2n + 1,). With an external force or a heat power it has three more components,
     the work W and the heat Q received so far and the time t: (q, v, S, W, Q, t), where the last three may be left
     out of an initial state and then are 0. The energy of such a system is ``E - W - Q``, that of system and
-    surroundings: constant again, and what a run loses of it is the defect of its energy balance. The audit has
-    both sides of the ledger.
+    surroundings: it is constant, and its change in a run is the defect of the energy balance. The audit has both
+    sides of the ledger.
 
     :class:`liethermo.VariationalIntegrator` discretises its variational principle; the metriplectic schemes run it too.
 
     With ``space=`` the positions are the points of a manifold Q, and states have the arrays of q and v in one row.
-    Forces act along Q: what a function gives across it is what the constraint takes up.
+    Forces act along Q: the constraint cancels their components normal to Q.
 
     Parameters
     ----------
@@ -58,27 +58,22 @@ class SimpleClosedSystem(LedgerSystem, VelocityContactSystem):
         F_ext (force).
     heat_power : function of (q, v, S) or (q, v, S, t), to a scalar; or a number; optional
         P_H, the heat received per time (power).
-    momentum_maps : dict of functions, or a sequence of them
-        Conserved quantities of a symmetry, functions of the state.
-    validate : bool
-        Test the axioms at a few random points, that friction brakes among them. Turn off where a function is not
-        defined at normally distributed points, and use ``system.check(points=...)``.
+    momentum_maps, validate : dict of functions, or a sequence of them; bool
+        Conserved quantities of a symmetry, functions of the state; and whether to test the axioms, and that friction
+        brakes, at a few random points. Use ``system.check(points=...)`` instead if a function is not defined there.
     space : manifolds.Space, optional
         Q: a space of real arrays, of whose shape q, v and forces then are in all of these functions.
 
     Raises
     ------
     AxiomError, FunctionError, InputError
-        InputError for a singular Lagrangian.
+        If an axiom fails, or a function or an argument does not fit; InputError for a singular Lagrangian.
 
     Attributes
     ----------
-    contact : manifolds.LagrangianContact
-    lagrangian : Energy
-    degrees_of_freedom : int
-        Components of q.
-    configurations : manifolds.Space or None
-        Q, where it is not R^n.
+    contact, lagrangian : manifolds.LagrangianContact, Energy
+    degrees_of_freedom, configurations : int, and manifolds.Space or None
+        The number of components of q, and Q if it is not R^n.
     """
 
     entropy_production_name: ClassVar[str] = "dS/dt"

@@ -71,11 +71,9 @@ class SpinSystem(TorqueSystem):
     baths : HeatBaths, optional
         The baths that take the heat of the damping.
     ratio : float, or array of the shape of the sites
-        gamma_i.
-    momentum_maps : dict of functions, or a sequence of them
-        Of s, shape ``(*sites, 3)``.
-    validate : bool
-        Test the axioms at a few random points.
+        gamma_i (1 / (energy * time), if s has no unit).
+    momentum_maps, validate
+        As for :class:`LiePoissonSystem`; functions of s, shape ``(*sites, 3)``.
     torque : function w of t, shape (), and s, shape ``(*sites, 3)``; or a list of them; optional
         Torques ``s x w`` (w in 1 / time) from outside, such as ``lt.magnetism.Slonczewski``. Each |s_i| stays constant.
         The torque does the work W, ``W' = sum grad_i H . (s_i x w_i)``, and the energy less the work is constant.
@@ -86,6 +84,7 @@ class SpinSystem(TorqueSystem):
     Raises
     ------
     InputError, FunctionError, AxiomError
+        If an argument or a function does not fit, or an axiom fails.
 
     Examples
     --------

@@ -234,6 +234,8 @@ def check_system(
         By default a step moves the state by a hundredth of its norm.
     methods : sequence of OneStepMethod
         The methods that are tried on it.
+    seed : int
+        Seed of the random points.
 
     Raises
     ------
@@ -263,6 +265,8 @@ def check_dissipation(dissipation: Dissipation | System, algebra: mf.LieAlgebra 
         A dissipation on the dual of a Lie algebra, or a system that contains it.
     algebra : LieAlgebra, optional
         The algebra of the test system, so(3) by default. Its energy is not quadratic, its entropy a quadratic Casimir.
+    seed : int
+        Seed of the random points.
 
     Raises
     ------

@@ -46,7 +46,7 @@ def is_zero(value: float, scale: float = 1.0) -> bool:
     """Return True if a number is zero relative to a scale; raise AmbiguousRoundingError if rounding does not tell."""
     size = abs(value) / scale
     if ZERO_TOLERANCE < size < NONZERO_TOLERANCE:
-        raise AmbiguousRoundingError(f"a value of relative size {size:.1e} may be zero or rounding")
+        raise AmbiguousRoundingError(f"a value of relative size {size:.1e} may be zero or a rounding error")
     return size <= ZERO_TOLERANCE
 
 

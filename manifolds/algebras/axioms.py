@@ -77,7 +77,7 @@ def constants_and_matrices(basis) -> tuple[np.ndarray, np.ndarray]:
         a, b = divmod(int(residuals.argmax()), dim)
         raise ClosureError(
             f"[e{a + 1}, e{b + 1}] leaves the span of the {dim} matrices (residual {residuals.max():.3g} "
-            f"for matrices of norm 1, tolerance {tolerance:.1g}); add the missing commutators to the basis",
+            f"for matrices of norm 1, tolerance {tolerance:.1g}). Add the missing commutators to the basis",
             residual=float(residuals.max()),
             tolerance=tolerance,
             indices=(a, b),

@@ -30,7 +30,7 @@ def constants_and_names(brackets: Mapping, basis: Iterable[str] | None) -> tuple
         for name in (*pair, *combination):
             if name not in index:
                 raise ParameterError(
-                    f"the bracket of {pair} has the element {name!r}, which is not in basis={names!r}; add it there"
+                    f"the bracket of {pair} has the element {name!r}, which is not in basis={names!r}. Add it to basis="
                 )
     constants = np.full((len(names),) * 3, Fraction(0), dtype=object)
     for (name_a, name_b), combination in table.items():

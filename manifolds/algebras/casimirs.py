@@ -419,7 +419,7 @@ def casimirs(g: AlgebraStructure, degree: int) -> list[Polynomial | TracePolynom
         warn(
             f"{g.name} has {n_casimirs} independent Casimir{'s' if n_casimirs > 1 else ''}, but no polynomial one "
             f"{'of degree 1' if degree == 1 else f'up to degree {degree}'}. There may be one of higher degree, or "
-            "they may be rational or transcendental (for bianchi('V') it is mu2/mu3): raise the degree, or solve "
+            "they may be rational or transcendental (for bianchi('V') it is mu2/mu3). Raise the degree, or solve "
             "ad*_(grad C) mu = 0 by hand and use the solution as a function of mu",
             NoPolynomialCasimirWarning,
         )

@@ -60,6 +60,11 @@ def registered() -> Iterator[LieAlgebra]:
 def abelian(n: int) -> LieAlgebra:
     """Return the abelian algebra R^n, as translations.
 
+    Parameters
+    ----------
+    n : int
+        The dimension.
+
     Examples
     --------
     >>> float(abs(mf.abelian(2).structure_constants).max())
@@ -119,6 +124,13 @@ def su(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
 
     su(2) has the structure constants of so(3); su(3) the usual f_abc.
 
+    Parameters
+    ----------
+    n : int
+        The size of the matrices.
+    by_matrices : bool, optional
+        Represent the algebra by its matrices, without an array of structure constants; by default above dimension 120.
+
     Examples
     --------
     >>> mf.su(3).dim
@@ -132,6 +144,13 @@ def su(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
 @register((2,))
 def u(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
     """Return u(n), the anti-Hermitian matrices: the basis of su(n), then the centre ``-i/2 sqrt(2/n) 1``.
+
+    Parameters
+    ----------
+    n : int
+        The size of the matrices.
+    by_matrices : bool, optional
+        Represent the algebra by its matrices, without an array of structure constants; by default above dimension 120.
 
     Examples
     --------
@@ -150,6 +169,13 @@ def sl(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
 
     sl(2) is (h, e, f) with ``[h, e] = 2e``, ``[h, f] = -2f``, ``[e, f] = h``.
 
+    Parameters
+    ----------
+    n : int
+        The size of the matrices.
+    by_matrices : bool, optional
+        Represent the algebra by its matrices, without an array of structure constants; by default above dimension 120.
+
     Examples
     --------
     >>> mf.sl(2).dim
@@ -164,6 +190,13 @@ def sl(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
 @register((1,), (2,))
 def sp(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
     """Return sp(2n, R): matrices ``[[A, B], [C, -A^T]]`` with B and C symmetric; A row by row, then B, then C.
+
+    Parameters
+    ----------
+    n : int
+        Half the size of the matrices.
+    by_matrices : bool, optional
+        Represent the algebra by its matrices, without an array of structure constants; by default above dimension 120.
 
     Examples
     --------
@@ -210,6 +243,13 @@ _OCTONIONS = (
 def gl(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
     """Return gl(n), all real matrices, with the basis E_ij row by row.
 
+    Parameters
+    ----------
+    n : int
+        The size of the matrices.
+    by_matrices : bool, optional
+        Represent the algebra by its matrices, without an array of structure constants; by default above dimension 120.
+
     Examples
     --------
     >>> mf.gl(2).dim
@@ -225,6 +265,11 @@ def gl(n: int, *, by_matrices: bool | None = None) -> LieAlgebra:
 def se(n: int) -> LieAlgebra:
     """Return the rigid motions of R^n: the rotations so(n) first, then the translations.
 
+    Parameters
+    ----------
+    n : int
+        The dimension of the space on which the group acts.
+
     Examples
     --------
     >>> mf.se(3).dim
@@ -239,6 +284,11 @@ def se(n: int) -> LieAlgebra:
 def heisenberg(n: int = 1) -> LieAlgebra:
     """Return the Heisenberg algebra (q_1 … q_n, p_1 … p_n, z) with ``[q_i, p_i] = z``, as upper triangular matrices.
 
+    Parameters
+    ----------
+    n : int
+        The number of pairs (q_i, p_i).
+
     Examples
     --------
     >>> mf.heisenberg(2).dim
@@ -252,7 +302,13 @@ def heisenberg(n: int = 1) -> LieAlgebra:
 
 @register((2,), (3,))
 def galilei(n: int) -> LieAlgebra:
-    """Return the Galilei algebra of R^n: rotations J, boosts K, translations P, time shift H; ``[K_i, H] = P_i``."""
+    """Return the Galilei algebra of R^n: rotations J, boosts K, translations P, time shift H; ``[K_i, H] = P_i``.
+
+    Parameters
+    ----------
+    n : int
+        The dimension of the space on which the group acts.
+    """
     n = checked_size(n, 2, "galilei(n)")
     rotations = np.zeros((n * (n - 1) // 2, n + 2, n + 2))
     rotations[:, :n, :n] = so(n).basis
@@ -263,7 +319,13 @@ def galilei(n: int) -> LieAlgebra:
 
 @register((1,), (2,))
 def aff(n: int = 1) -> LieAlgebra:
-    """Return the affine maps of R^n: gl(n) row by row, then the translations. aff(1) has ``[e1, e2] = e2``."""
+    """Return the affine maps of R^n: gl(n) row by row, then the translations. aff(1) has ``[e1, e2] = e2``.
+
+    Parameters
+    ----------
+    n : int
+        The dimension of the space on which the group acts.
+    """
     n = checked_size(n, 1, "aff(n)")
     return semidirect_sum(gl(n), gl(n).basis, name=f"aff({n})")
 

@@ -43,28 +43,21 @@ class LieAlgebra(StructureMethods):
     Build one with :meth:`from_structure_constants`, :meth:`from_matrices`, or a name of the catalogue
     (``manifolds.so(3)``). Two algebras are equal when their constants and matrices are.
 
+    Large algebras, and copies of one (``g ** n``), are of this class too; they compute the constants, the matrices and
+    the forms only on demand. More members: ``dir(g)``, such as ``radical``, ``isomorphism_type``, ``change_of_basis``.
     Statements about the structure (``is_semisimple``, ``derived_series``, …) do not depend on the basis: it is scaled
     first, so that the constants have similar sizes. Constants below 1e-10 then count as zero.
 
     Attributes
     ----------
-    dim : int
-        The dimension.
-    name : str
-        The name in messages.
+    dim, name : int, str
+        The dimension, and the name in messages.
     structure_constants : ndarray, shape (dim, dim, dim), read-only
         ``C[a, b, c]`` with ``[e_a, e_b] = sum_c C[a, b, c] e_c``.
     rational_constants : RationalArray or None
         The same constants as exact fractions, where they are recognised as such and are not too large.
-    basis : ndarray, shape (dim, m, m), or None
-        The matrices ``e_a``, where known.
-    basis_names : tuple of str, or None
-        Names of the basis elements in Casimirs and figures; see :meth:`with_basis_names`.
-
-    Notes
-    -----
-    Large algebras, and copies of one (``g ** n``), are of this class too; they compute the constants, the matrices and
-    the forms only on demand. More members: ``dir(g)``, such as ``radical``, ``isomorphism_type``, ``change_of_basis``.
+    basis, basis_names : ndarray, shape (dim, m, m), or None; tuple of str, or None
+        The matrices ``e_a``, where known, and the names of ``e_a`` in Casimirs and figures: :meth:`with_basis_names`.
 
     Examples
     --------
@@ -151,6 +144,9 @@ class LieAlgebra(StructureMethods):
     def from_brackets(cls, brackets, *, name: str = "g", basis=None) -> LieAlgebra:
         """Return the algebra with the given brackets of named basis elements; all other brackets are zero.
 
+        ParameterError, ComponentError, AntisymmetryError or JacobiError for unknown names, contradictory entries, or
+        brackets that break the Jacobi identity.
+
         Parameters
         ----------
         brackets : dict
@@ -161,16 +157,9 @@ class LieAlgebra(StructureMethods):
         basis : sequence of str, optional
             The names of all basis elements in their order; by default ``e1``, ``e2``, … or the order of occurrence.
 
-        Raises
-        ------
-        ParameterError, ComponentError, AntisymmetryError, JacobiError
-            For unknown names, contradictory entries, or brackets that break the Jacobi identity.
-
         Examples
         --------
-        >>> g = mf.LieAlgebra.from_brackets(
-        ...     {("e2", "e4"): "e1", ("e3", "e4"): {"e2": 1}}, name="A4,1"
-        ... )
+        >>> g = mf.LieAlgebra.from_brackets({("e2", "e4"): "e1", ("e3", "e4"): {"e2": 1}})
         >>> print(*g.casimirs(max_degree=2), sep=", ")
         e1, 2*e1*e3 - e2**2
         """
@@ -472,10 +461,8 @@ class LieAlgebra(StructureMethods):
         """Return pairs (name, Casimir) of low degree that are quick to find and to evaluate, to follow along a motion.
 
         The Casimirs are functions from mu, shape (dim,), to a number. A small algebra has its polynomial ones, as many
-        as
-        there are; copies on sites have the Casimirs of a few copies, or the sums over many; a large matrix algebra has
-        the
-        traces of the first powers.
+        as there are; copies on sites have the Casimirs of a few copies, or the sums over many; a large matrix algebra
+        has the traces of the first powers.
         """
         return leading_casimirs(self)
 
@@ -506,7 +493,7 @@ class LieAlgebra(StructureMethods):
         """Return the matrices of the basis; raise LieAlgebraError if the algebra has none."""
         if self.basis is None:
             raise LieAlgebraError(
-                f"{self.name} was defined by structure constants and has no matrices; build it with "
+                f"{self.name} was defined by structure constants and has no matrices. Build it with "
                 "LieAlgebra.from_matrices to use hat and vee"
             )
         return self.basis

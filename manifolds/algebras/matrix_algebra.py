@@ -62,8 +62,7 @@ class MatrixAlgebra(BracketAlgebra):
 
     ``[x, y]`` and ``ad*_x mu`` are computed from the matrices of x, y and mu: mu is the matrix M of the algebra with
     ``<mu, y> = Re tr(M^H y)``, so ``ad*_x mu`` is the covector of ``[x^H, M]``. A product of complex matrices takes
-    three
-    real ones, and a commutator of anti-Hermitian matrices takes one product.
+    three real ones, and a commutator of anti-Hermitian matrices takes one product.
 
     Attributes
     ----------
@@ -124,10 +123,7 @@ class MatrixAlgebra(BracketAlgebra):
     def vee(self, X) -> jax.Array:
         """Return the components of a matrix of the algebra, shape (..., dim): the inverse of :meth:`hat`.
 
-        Raises
-        ------
-        LieAlgebraError
-            If ``X`` is not in the algebra (residual above 1e-8 relative; not checked under tracing).
+        LieAlgebraError if ``X`` is not in the algebra (residual above 1e-8 relative), except under tracing.
         """
         matrix = square_matrices(X, self.matrix_size, "X")
         components = self._components(self._split_parts(matrix))
@@ -293,6 +289,13 @@ class MatrixTrace:
     """Casimir ``tr(M(mu)**degree)``, for anti-Hermitian matrices ``tr((i M)**degree)``: shape (..., dim) to (...).
 
     M(mu) is :meth:`MatrixAlgebra.dual_matrix`.
+
+    Parameters
+    ----------
+    algebra : MatrixAlgebra
+        The algebra.
+    degree : int
+        The power of the matrix.
     """
 
     algebra: MatrixAlgebra

@@ -59,7 +59,7 @@ class Polynomial(metaclass=ListedType):
         if powers.ndim != 2 or len(powers) != len(coefficients):
             raise ShapeError(
                 f"{len(coefficients)} coefficients need exponents of shape ({len(coefficients)}, dim), "
-                f"not {powers.shape}"
+                f"got {powers.shape}"
             )
         if powers.size and (not np.issubdtype(powers.dtype, np.integer) or powers.min() < 0):
             raise ComponentError("the exponents of a polynomial must be integers >= 0")

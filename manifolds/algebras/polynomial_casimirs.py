@@ -122,7 +122,7 @@ def _check_size(size: int, limit: int, label: str) -> None:
     if size > limit:
         raise TooLargeError(
             f"{label}, more than the {limit} that the search for Casimirs allows, and no traces of powers of matrices "
-            "are known to generate them all: ask for a lower degree, or build a reductive algebra from matrices"
+            "are known to generate them all. Use a lower degree, or build a reductive algebra from matrices"
         )
 
 

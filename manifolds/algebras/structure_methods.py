@@ -185,7 +185,9 @@ def constants_in_basis(g: AlgebraStructure, rows) -> tuple[np.ndarray, np.ndarra
             f"{matrix.shape} of {matrix.dtype}"
         )
     exact, fractions = g.rational_constants, rational_array(matrix)
-    dependent = LieAlgebraError(f"the {g.dim} rows of a new basis of {g.name} are linearly dependent; replace some")
+    dependent = LieAlgebraError(
+        f"the {g.dim} rows of a new basis of {g.name} are linearly dependent. Replace some of them"
+    )
     if exact is not None and fractions is not None:
         P = fraction_rows(fractions.numerator) * Fraction(1, fractions.denominator)
         augmented_matrix, pivots = row_echelon(

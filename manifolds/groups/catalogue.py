@@ -58,7 +58,13 @@ def SO(n: int) -> MatrixGroup:
 
 @register((2,), (3,))
 def SE(n: int) -> MatrixGroup:
-    """Return the group of rigid motions of R^n, homogeneous matrices ``[[rotation, translation], [0, 1]]``."""
+    """Return the group of rigid motions of R^n, homogeneous matrices ``[[rotation, translation], [0, 1]]``.
+
+    Parameters
+    ----------
+    n : int
+        The dimension of the space; the matrices have the size n + 1.
+    """
     group = MatrixGroup(
         f"SE({n})",
         catalogue.se(n),
@@ -80,7 +86,13 @@ def SE(n: int) -> MatrixGroup:
 
 @register((2,), (3,))
 def SU(n: int) -> MatrixGroup:
-    """Return the group of unitary complex matrices of determinant 1."""
+    """Return the group of unitary complex matrices of determinant 1.
+
+    Parameters
+    ----------
+    n : int
+        The size of the matrices.
+    """
     group = MatrixGroup(
         f"SU({n})",
         catalogue.su(n),
@@ -99,7 +111,13 @@ def SU(n: int) -> MatrixGroup:
 
 @register((2,), (3,))
 def SL(n: int) -> MatrixGroup:
-    """Return the group of real matrices of determinant 1. The Cayley map exists for n = 2 only, where SL(2) = Sp(1)."""
+    """Return the group of real matrices of determinant 1. The Cayley map exists for n = 2 only, where SL(2) = Sp(1).
+
+    Parameters
+    ----------
+    n : int
+        The size of the matrices.
+    """
     group = MatrixGroup(f"SL({n})", catalogue.sl(n), closed.unimodular_defect, restore_map=closed.restore_unimodular)
     if n == 2:
         return replace(group, adjoint_cayley_map=closed.adjoint_cayley_gl2, equations=closed.symplectic_equations)
@@ -108,7 +126,13 @@ def SL(n: int) -> MatrixGroup:
 
 @register((2,))
 def Sp(n: int) -> MatrixGroup:
-    """Return the group Sp(2n, R): ``g^T J g = J`` with ``J = [[0, I], [-I, 0]]``."""
+    """Return the group Sp(2n, R): ``g^T J g = J`` with ``J = [[0, I], [-I, 0]]``.
+
+    Parameters
+    ----------
+    n : int
+        Half the size of the matrices.
+    """
     return MatrixGroup(
         f"Sp({n})",
         catalogue.sp(n),
@@ -123,7 +147,13 @@ def Sp(n: int) -> MatrixGroup:
 @register((2,))
 def GL(n: int) -> MatrixGroup:
     """Return the group of invertible real matrices; ``exp`` and ``log`` concern GL+, the component of positive
-    determinant."""
+    determinant.
+
+    Parameters
+    ----------
+    n : int
+        The size of the matrices.
+    """
     return MatrixGroup(
         f"GL({n})",
         catalogue.gl(n),
@@ -134,7 +164,13 @@ def GL(n: int) -> MatrixGroup:
 
 @register((1,), (2,))
 def Heisenberg(n: int = 1) -> MatrixGroup:
-    """Return the group of matrices ``[[1, q, z], [0, I, p], [0, 0, 1]]``, whose Cayley map is the exponential."""
+    """Return the group of matrices ``[[1, q, z], [0, I, p], [0, 0, 1]]``, whose Cayley map is the exponential.
+
+    Parameters
+    ----------
+    n : int
+        The number of pairs (q_i, p_i); the matrices have the size n + 2.
+    """
     return MatrixGroup(
         f"Heisenberg({n})",
         catalogue.heisenberg(n),
@@ -200,7 +236,7 @@ def subalgebra_basis(group: MatrixGroup, spanning_matrices) -> np.ndarray:
         if (residual := np.linalg.norm(bracket - rows.T @ (rows @ bracket))) > SUBALGEBRA_TOLERANCE:
             raise ParameterError(
                 f"the stabilizer in {group.name} is not a subalgebra: the bracket of its directions {j} and {i} is "
-                f"{residual:.2g} off their span; add what is missing"
+                f"{residual:.2g} off their span. Add the missing directions"
             )
     return rows
 

@@ -118,7 +118,8 @@ class MatrixGroup(metaclass=ListedType):
     def from_equations(cls, f: Callable, n: int, name: str = "G") -> MatrixGroup:
         """Return the group of real matrices that solve ``f(A) = 0`` near the identity.
 
-        Its algebra is the kernel of the derivative of f at the identity.
+        Its algebra is the kernel of the derivative of f at the identity. ParameterError or ClosureError if f does not
+        vanish at the identity or its solutions nearby do not form a group.
 
         Parameters
         ----------
@@ -129,11 +130,6 @@ class MatrixGroup(metaclass=ListedType):
             The size of the matrices.
         name : str
             The name in messages.
-
-        Raises
-        ------
-        ParameterError, ClosureError
-            If f does not vanish at the identity or its solutions nearby do not form a group.
 
         Examples
         --------
@@ -349,10 +345,7 @@ class MatrixGroup(metaclass=ListedType):
     def Ad(self, g) -> jax.Array:
         """Return the adjoint action, the matrix of ``x -> vee(g hat(x) g^-1)``, shape (..., dim, dim).
 
-        Raises
-        ------
-        DomainError
-            If g is not in the group (not checked under tracing).
+        DomainError if g is not in the group (not checked under tracing).
         """
         g = self._element(g, "g")
         if not is_traced(g):

@@ -308,8 +308,7 @@ def spectral_difference(f: Callable | ScalarFunction, a, b) -> jax.Array:
     n, n).
 
     ``G = sum f[p_k, q_l] |k><k|l><l|``, or its Hermitian part, over the eigenvectors of a and of b. It is ``f'(a)`` if
-    a
-    and b are equal, it is symmetric in a and b, and its rounding error is relative: no difference of values is taken.
+    a and b are equal, it is symmetric in a and b, and its rounding error is relative: no difference of values is taken.
 
     Parameters
     ----------

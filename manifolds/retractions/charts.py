@@ -43,6 +43,11 @@ class QRRetraction(_StiefelChart):
 
     Its order is 1, and it is the cheapest chart of a Stiefel manifold. The inverse solves p triangular sets of linear
     equations [Kaneko, Fiori & Tanaka 2013].
+
+    Parameters
+    ----------
+    space : Space
+        The space of the points.
     """
 
     space: Space
@@ -72,6 +77,11 @@ class PolarRetraction(_StiefelChart):
 
     Its order is 1 in the canonical metric, and 2 in the metric of the surrounding matrices. The inverse solves a
     Lyapunov equation of p rows.
+
+    Parameters
+    ----------
+    space : Space
+        The space of the points.
     """
 
     space: Space
@@ -99,6 +109,11 @@ class StiefelCayleyRetraction(_StiefelChart):
 
     Its order is 2 in the canonical metric [Wen & Yin 2013]. The inverse is
     ``2 x (I + z^T x)^-1 + 2 z (I + x^T z)^-1 - 2 z`` [Zhu & Sato 2020].
+
+    Parameters
+    ----------
+    space : Space
+        The space of the points.
     """
 
     space: Stiefel
@@ -126,6 +141,11 @@ class RiemannianRetraction(Chart):
     """Retraction ``R_h(z, v) = (z, exp_z(h v))`` by the Riemannian exponential map of the space [BFM §4.4].
 
     It exists on every space that has geodesics. The domain is the ball of the injectivity radius.
+
+    Parameters
+    ----------
+    space : Space
+        The space of the points.
     """
 
     space: Space
@@ -145,6 +165,11 @@ class EuclideanRetraction(Chart):
 
     On SPD(n) the step is bounded to length 1 in the affine-invariant metric, which guarantees that z + h v is positive
     definite.
+
+    Parameters
+    ----------
+    space : Space
+        The space of the points.
     """
 
     space: Space
@@ -178,6 +203,11 @@ class ProjectionRetraction(Chart):
 
     Newton's method in the frame of z computes its inverse. The order is one with any projection, and two with the
     nearest point [Absil & Malick 2012].
+
+    Parameters
+    ----------
+    space : Space
+        The space of the points.
     """
 
     space: Space
@@ -229,6 +259,11 @@ class GroupRetraction(_GroupChart):
 
     On SO(n) and SU(n) it is the Riemannian retraction, and on a GroupSpace that of the space. On SE(n) it follows screw
     motions, which agree with geodesics to first order.
+
+    Parameters
+    ----------
+    space : Space
+        The space of the points.
     """
 
     space: Space
@@ -249,6 +284,11 @@ class CayleyRetraction(_GroupChart):
     It is rational, so cheaper than the exponential, and one to one on the whole tangent space, which covers the group
     except the half turns. With z in the middle, a step is bounded by 4/pi of the injectivity radius: there it is a half
     turn.
+
+    Parameters
+    ----------
+    space : Space
+        The space of the points.
     """
 
     space: Space

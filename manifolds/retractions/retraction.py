@@ -176,8 +176,7 @@ class Chart(Retraction):
         """Carry the tangent vector u from z to ``x = point(z, v)``, such that ``point(x, -carry(z, v, v))`` is z.
 
         The Riemannian chart carries by parallel transport; charts of groups preserve the left-trivialised velocity.
-        With
-        ``w = carry(z, v, u)``, ``carry(x, -carry(z, v, v), w)`` is u again.
+        With ``w = carry(z, v, u)``, ``carry(x, -carry(z, v, v), w)`` is u again.
         """
         return run_kernel(self, "_carry", (), *self.space._checked_point_and_vectors(z, "z", v=v, u=u))
 
@@ -280,7 +279,15 @@ class Coordinates(Module):
 
 
 def coordinates_around(chart: Chart, z) -> Coordinates:
-    """Return coordinates around a point, shape ``(*space.shape)``, or around each point of a batch."""
+    """Return coordinates around a point, shape ``(*space.shape)``, or around each point of a batch.
+
+    Parameters
+    ----------
+    chart : Chart
+        The chart of the space.
+    z : array, shape ``(*space.shape)``, or ``(..., *space.shape)``
+        The point, or a batch of points.
+    """
     if isinstance(chart.space, Product):
         factor_points = zip(chart.space.factors, chart.space.split(z), strict=True)
         return _ProductCoordinates(

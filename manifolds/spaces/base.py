@@ -116,8 +116,7 @@ class Space(SpaceMaps):
         return y
 
     def random(self, key_or_seed, size: tuple[int, ...] = ()) -> jax.Array:
-        """Return random points, shape ``(*size, *shape)``: uniform on a compact space, else within a few units of a
-        centre.
+        """Return random points, shape ``(*size, *shape)``: uniform if the space is compact, else around a centre.
 
         Parameters
         ----------
@@ -244,10 +243,7 @@ class Space(SpaceMaps):
     def log(self, x, y) -> jax.Array:
         """Return the v of least length with ``exp(x, v) = y``, a tangent vector at x: the Riemannian logarithm.
 
-        Parameters
-        ----------
-        x, y : array, shape ``(..., *shape)``
-            Points.
+        The points x and y have the shape ``(..., *shape)``.
 
         Raises
         ------
@@ -266,12 +262,7 @@ class Space(SpaceMaps):
 
         The derivative at y = x is taken as 0. ``distance(x, y)**2`` has exact derivatives there. Other smooth functions
         of the distance, such as ``1 - cos(d)``, have exact derivatives up to the third: use :meth:`squared_distance`
-        if you need higher ones.
-
-        Raises
-        ------
-        DomainError
-            Where it is computed from :meth:`log` and that is not defined.
+        if you need higher ones. DomainError if the distance follows from :meth:`log` and the logarithm is undefined.
         """
         x, y = self._checked_point(x, "x"), self._checked_point(y, "y")
         d = self._distance(x, y)
@@ -313,8 +304,7 @@ class Space(SpaceMaps):
         """Return the length of v divided by the injectivity radius; below 1, ``log`` recovers v from ``exp(x, v)``.
 
         It is defined under tracing too, where it tells if a step stays in the domain. In a product it is the largest
-        over
-        the factors.
+        over the factors.
         """
         return self._call_compiled("_reach", *self._checked_point_and_vectors(x, v=v))
 

@@ -20,7 +20,13 @@ from .maps import inner_by_coordinates, safe_sqrt, tangential_part_by_projection
 @jax.tree_util.register_static
 @dataclass(frozen=True, init=False, repr=False)
 class Euclidean(Space):
-    """Arrays of a given shape: ``Euclidean(3)`` is R^3, ``Euclidean(2, 4)`` the 2 x 4 matrices."""
+    """Arrays of a given shape: ``Euclidean(3)`` is R^3, ``Euclidean(2, 4)`` the 2 x 4 matrices.
+
+    Parameters
+    ----------
+    sizes : int
+        The shape of a point.
+    """
 
     sizes: tuple[int, ...]
     metric = "flat"
@@ -253,8 +259,13 @@ class Hyperbolic(Space):
     its position, and with it a distance, is known to about 1e-16 e^r. From r = 35 on, this is more than the unit of
     length: directions from the apex that agree to rounding are taken as equal there, so that points on one ray have the
     difference of their radii as distance. Points with r > 354 are refused, since squares of coordinates overflow.
-    Vectors at a point, and geodesics with given velocities, are
-    known to about 1e-16 e^(2r): keep the states of interest near the apex.
+    Vectors at a point, and geodesics with given velocities, are known to about 1e-16 e^(2r): keep the states of
+    interest near the apex.
+
+    Parameters
+    ----------
+    n : int
+        The dimension; a point has n + 1 components.
     """
 
     n: int

@@ -389,8 +389,7 @@ def _log_jvp(space: GeomstatsSpace, primals, tangents):
     """Return the logarithm and its derivative along ``tangents``, by differentiating ``exp(x, v) = y``.
 
     As x moves by x', v moves with the tangent space, by D, and in it, by the combination of frame vectors that
-    satisfies
-    ``d_v exp (D + frame c) + d_x exp x' = y'``.
+    satisfies ``d_v exp (D + frame c) + d_x exp x' = y'``.
     """
     (x, y), (dx, dy) = primals, tangents
     v, size = _log(space, x, y), math.prod(space.shape)

@@ -318,6 +318,11 @@ class SpecialOrthogonal(BiInvariantSpace):
     """Rotations of R^n, with ``inner(x, u, v) = tr(u^T v) / 2``: the distance of rotations of one plane is their angle.
 
     n = 2 and 3 have closed forms; other n use general matrix functions.
+
+    Parameters
+    ----------
+    n : int
+        The size of the matrices.
     """
 
     n: int
@@ -361,8 +366,12 @@ class SpecialUnitary(BiInvariantSpace):
     """Complex unitary matrices of determinant 1, with ``inner(x, u, v) = 2 Re tr(u^H v)``.
 
     SU(2) is a sphere S^3 of radius 2, with closed forms. The logarithm is the principal one: for n > 2 it reaches to
-    the
-    radius ``pi sqrt(2n/(n-1))`` given here, less than the injectivity radius 2 pi of the space.
+    the radius ``pi sqrt(2n/(n-1))`` given here, less than the injectivity radius 2 pi of the space.
+
+    Parameters
+    ----------
+    n : int
+        The size of the matrices.
     """
 
     n: int

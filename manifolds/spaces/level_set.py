@@ -42,20 +42,17 @@ class LevelSet(Space):
     ----------
     constraints : function, or a sequence of functions
         From an array of the given shape to a number, or to an array of them: smooth, and independent of each other.
-    shape : int, or tuple of int
-        The shape of a point.
+    shape, name : int or tuple of int, and str
+        The shape of a point, and the name of the space in messages.
     metric : array, shape (n, n), or function from x to one; optional
         Positive definite (dimensionless, or in any units): inner products of flattened arrays, n their number of
         entries, restricted to the manifold. By default the sum of products.
-    name : str
-        The name in messages.
 
     Raises
     ------
-    SpaceError
-        If the constraints are not such functions, depend on each other, or no random array leads to a point.
-    ParameterError
-        If the shape or the metric cannot be used.
+    SpaceError, ParameterError
+        If the constraints are not such functions, depend on each other, or no random array leads to a point; if the
+        shape or the metric cannot be used.
 
     Examples
     --------

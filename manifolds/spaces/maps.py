@@ -22,9 +22,8 @@ class SpaceMaps(metaclass=ListedABCMeta):
     """Maps of a state space as its author writes them: plain JAX functions of checked arrays.
 
     Leading axes are batches. ``name``, ``dim``, ``shape`` and ``_project`` are required; the other maps have defaults
-    that
-    follow from these, or raise an error with the reason, and may be overridden. :class:`manifolds.Space` documents the
-    public ones.
+    that follow from these, or raise an error with the reason, and may be overridden. :class:`manifolds.Space` documents
+    the public ones.
     """
 
     metric: str = "induced"

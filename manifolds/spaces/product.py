@@ -26,6 +26,11 @@ class Product(Space):
 
     :meth:`split` and :meth:`join` convert between that array and the points of the factors. The metric is the sum.
 
+    Parameters
+    ----------
+    factors : Space
+        The spaces, in the order of their points in the array.
+
     Examples
     --------
     >>> space = mf.Sphere(2) * mf.Euclidean(1)
@@ -269,6 +274,11 @@ class Power(Space):
     """Product of ``count`` copies of a space, also written ``A**count``: points of shape ``(count, *base.shape)``.
 
     ``Sphere(2) ** 100`` holds the states of a chain of a hundred spins. The copies run as one batch.
+
+    Parameters
+    ----------
+    base, count : Space, int
+        The space, and the number of its copies.
     """
 
     base: Space
@@ -481,8 +491,7 @@ class TangentBundle(Space):
         """Return matrices P and N, shape (n, n), for which ``(P a, P b + N P a)`` are tangent vectors at flat (q, v).
 
         P is the projector along Q. Moving q takes v out of the tangent space: ``N q'`` is the component of v' across Q
-        that
-        compensates for it.
+        that compensates for it.
         """
         base, (q, v) = self.base, self._position_and_vector(self.from_vector(x))
         rate_jacobian = jax.jacfwd(lambda y: self._constraint_rates(base.from_vector(y), v))(base.to_vector(q))

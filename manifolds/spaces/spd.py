@@ -45,6 +45,11 @@ class SPD(PositiveDefinite):
     of x instead of their square root: ``exp(x, v) = L expm(L^-1 v L^-T) L^T``. The result is known to rounding of its
     largest entry, so eigenvalues smaller than that by 1e16 are lost.
 
+    Parameters
+    ----------
+    n : int
+        The size of the matrices.
+
     Examples
     --------
     The midpoint of two matrices is their geometric mean:
@@ -158,6 +163,11 @@ class Correlation(PositiveDefinite):
     The Cholesky factor L of x, with each row divided by its entry on the diagonal, is a triangular matrix with ones on
     the diagonal, and any such matrix belongs to one x. Its other entries are coordinates in which the metric is the sum
     of products, so that the space is complete and flat, and geodesics are unique [Thanwerdas & Pennec 2022].
+
+    Parameters
+    ----------
+    n : int
+        The size of the matrices.
     """
 
     n: int

@@ -43,6 +43,11 @@ class Stiefel(Space):
     Newton's method computes it from the projected chord, and it is accepted inside the injectivity radius only, where
     it is unique. That radius is pi for p = 1 and p = n - 1; otherwise the bound ``2 pi / sqrt 5`` [Rentmeesters 2013].
 
+    Parameters
+    ----------
+    n, p : int
+        The numbers of rows and of columns, 0 < p < n.
+
     Examples
     --------
     >>> space = mf.Stiefel(4, 2)
@@ -226,6 +231,11 @@ class Grassmann(Space):
     A tangent vector v at x is ``[W, x]`` for the skew ``W = [v, x]``, and the geodesic ``expm(W) x expm(-W)``. Its
     length is sqrt(2) times the root of the sum of the squared principal angles [Bendokat, Zimmermann & Absil 2024]. The
     logarithm is unique if no principal angle is a right angle.
+
+    Parameters
+    ----------
+    n, p : int
+        The dimensions of the space R^n and of the subspaces.
 
     Examples
     --------

@@ -141,6 +141,13 @@ class ContactForm(ContactStructure):
     """Contact structure given by its form, a function from x, shape (dim,), to the components of eta.
 
     The form is not checked: ``volume`` measures at a point whether it is a contact form.
+
+    Parameters
+    ----------
+    function : callable
+        From x, shape (dim,), to the components of eta, shape (dim,).
+    dim : int
+        The number of state components, odd.
     """
 
     function: Callable
@@ -285,6 +292,13 @@ class CanonicalContact(SplitContact):
 
     ``Lambda = d/dp ^ (d/dq + p d/dS)`` (4), and the evolution field of f is
     ``q' = f_p, p' = -f_q - p f_S, S' = p . f_p`` (7).
+
+    Parameters
+    ----------
+    degrees_of_freedom : int
+        n, the number of positions.
+    bundle : Bundle, optional
+        T*Q of a manifold Q instead of T*R^n.
     """
 
     def form(self, x) -> jax.Array:
@@ -407,6 +421,11 @@ class Cosymplectic(PoissonStructure):
     """Poisson structure Lambda_0 of a split contact structure; S is a Casimir function [SML §2.1].
 
     On T*R^n x R it is the canonical one, ``q' = H_p, p' = -H_q, S' = 0``; on T*Q x R that of T*Q.
+
+    Parameters
+    ----------
+    contact : SplitContact
+        The contact structure.
     """
 
     contact: SplitContact

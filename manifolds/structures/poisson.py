@@ -125,7 +125,13 @@ class PoissonStructure(Module):
 
 
 class LiePoisson(PoissonStructure):
-    """Lie-Poisson structure on g*: ``Pi(mu)[b, a] = sum_c C[a, b, c] mu_c``, so ``Pi(mu) xi = ad*_xi mu`` [BFM 3.1]."""
+    """Lie-Poisson structure on g*: ``Pi(mu)[b, a] = sum_c C[a, b, c] mu_c``, so ``Pi(mu) xi = ad*_xi mu`` [BFM 3.1].
+
+    Parameters
+    ----------
+    algebra : LieAlgebra
+        The Lie algebra g.
+    """
 
     algebra: LieAlgebra = eqx.field(static=True)
 
@@ -172,7 +178,13 @@ def _unitary_basis_and_dual(algebra: LieAlgebra) -> tuple[np.ndarray, np.ndarray
 
 
 class Canonical(PoissonStructure):
-    """Canonical structure on T*R^n, coordinates (q_1 … q_n, p_1 … p_n): ``q' = H_p``, ``p' = -H_q``."""
+    """Canonical structure on T*R^n, coordinates (q_1 … q_n, p_1 … p_n): ``q' = H_p``, ``p' = -H_q``.
+
+    Parameters
+    ----------
+    degrees_of_freedom : int
+        n, the number of positions.
+    """
 
     degrees_of_freedom: int = eqx.field(static=True)
 
@@ -199,6 +211,13 @@ class PoissonTensor(PoissonStructure):
 
     The tensor is not checked: ``jacobi_residual`` measures the Jacobi identity at a point, and a dynamical system
     built on the structure checks skewness and Jacobi at random points.
+
+    Parameters
+    ----------
+    matrix : array, shape (n, n), or function from x, shape (n,), to one
+        Pi, skew.
+    dim : int, optional
+        n. A function without it has states of any length.
 
     Examples
     --------
@@ -243,6 +262,13 @@ class PoissonMap(PoissonBySharp):
     """Poisson structure given by a function from x and a covector alpha, shapes (n,), to ``Pi(x) alpha``.
 
     It serves large n, where the matrix would be mostly zeros. It is not checked, as in :class:`PoissonTensor`.
+
+    Parameters
+    ----------
+    function : callable
+        From (x, alpha), two arrays of shape (n,), to ``Pi(x) alpha``, shape (n,); linear in alpha.
+    size : int
+        n, the number of state components.
     """
 
     function: Callable
@@ -290,7 +316,13 @@ class ProductPoisson(PoissonStructure):
 
 
 class NoPoisson(PoissonStructure):
-    """Trivial structure ``Pi = 0``: no reversible motion, and every function is a Casimir."""
+    """Trivial structure ``Pi = 0``: no reversible motion, and every function is a Casimir.
+
+    Parameters
+    ----------
+    size : int
+        The number of state components.
+    """
 
     size: int = eqx.field(static=True)
 
@@ -404,6 +436,13 @@ class ExtendedPhaseSpace(PoissonStructure):
 
     Every S_a is a Casimir function. With n_a = 0 a body has S_a alone. ``species`` gives the number of particle numbers
     that follow the S_a of each body; they are Casimir functions too.
+
+    Parameters
+    ----------
+    degrees_of_freedom : tuple of int
+        n_a, the number of positions of each body.
+    species : tuple of int
+        The number of particle numbers of each body; by default none.
     """
 
     degrees_of_freedom: tuple[int, ...] = eqx.field(static=True)

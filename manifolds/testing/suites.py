@@ -99,6 +99,8 @@ def check_algebra(g: LieAlgebra, degree: int = 3, seed: int = 0) -> Report:
         The algebra to test.
     degree : int
         Casimirs are looked for up to this degree.
+    seed : int
+        Seed of the random elements.
 
     Raises
     ------
@@ -181,6 +183,8 @@ def check_group(G: MatrixGroup, size: float = 0.5, seed: int = 0) -> Report:
         The group to test.
     size : float
         Size of the random elements of the algebra; below the radius in which the logarithm is defined.
+    seed : int
+        Seed of the random elements.
 
     Raises
     ------
@@ -244,6 +248,8 @@ def check_space(M: Space, length: float = 0.5, seed: int = 0, allowed: float = 1
         The space to test.
     length : float
         Length of the geodesics; at most 0.45 times the injectivity radius is used.
+    seed : int
+        Seed of the random points.
     allowed : float
         Largest residual, relative to the squared size of the points.
 

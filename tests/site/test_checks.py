@@ -58,6 +58,19 @@ def test_code_of_an_example_wider_than_a_page_is_found(check_text):
     assert "89 columns" in problem
 
 
+def test_code_of_a_docstring_wider_than_a_page_is_found(check_text):
+    module = f'class A:\n    """{100 * "w"}\n\n    >>> {{}}\n    """\n'
+    assert list(check_text.wide_docstrings({"a.py": module.format(84 * "x")})) == []
+    (problem,) = check_text.wide_docstrings({"a.py": module.format(85 * "x")})
+    assert "89 columns" in problem
+
+
+def test_the_code_of_the_docstrings_fits_a_page(check_text):
+    files = [file for package in ("liethermo", "manifolds") for file in (DOCS.parent / package).rglob("*.py")]
+    assert len(files) > 200
+    assert list(check_text.wide_docstrings({str(file): file.read_text() for file in files})) == []
+
+
 def test_the_code_of_the_examples_fits_a_page(check_text):
     examples = {file.name: file.read_text() for file in DOCS.parent.glob("examples/*/plot_*.py")}
     assert len(examples) > 30

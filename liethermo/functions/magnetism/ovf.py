@@ -270,7 +270,7 @@ def _read_data(content: bytes, data_start: int, data_kind: str, version: int, n_
         raise FileError(f"{path} has data of the kind {data_kind!r}. Text, binary 4 and binary 8 are read")
     width = int(data_kind[-1])
     if len(content) < data_start + width * (n_numbers + 1):
-        raise FileError(f"{path} is not complete: it must have {n_numbers} numbers of {width} bytes")
+        raise FileError(f"{path} must have {n_numbers} numbers of {width} bytes, got fewer. The file is not complete")
     following_text = content[data_start + width * (n_numbers + 1) :].lstrip()
     if following_text and not following_text.startswith(b"#"):
         raise FileError(

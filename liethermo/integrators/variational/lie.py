@@ -86,7 +86,7 @@ class LieVariational(OneStepMethod):
             return
         if algebra.basis is None:
             raise InputError(
-                f"the Cayley map needs matrices for {algebra.name}: build it with from_matrices, or take "
+                f"the Cayley map needs matrices for {algebra.name}. Build it with from_matrices, or use "
                 "lt.LieVariational('exp')"
             )
         X, Y = algebra.hat(np.random.default_rng(0).standard_normal((2, algebra.dim)))

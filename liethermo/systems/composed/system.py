@@ -77,29 +77,25 @@ class ComposedSystem(System):
         Fourier factors by the discrete temperatures, so that the entropy grows in each step for every energy, or by the
         temperatures at the midpoint, as SML §6.2 prints them: then it is known to grow for quadratic energies alone,
         and no law of it is stated.
-    membranes : sequence of Membrane
-        Membranes that particles pass.
-    reactions : sequence of Reaction
-        Reactions within bodies.
+    membranes, reactions : sequence of Membrane, sequence of Reaction
+        The membranes that particles pass, and the reactions within bodies.
     connected : bool
         Refuse a conductance whose graph falls into parts that exchange no heat.
-    momentum_maps : dict of functions, or a sequence of them
-        Conserved quantities of a symmetry, functions of the state.
-    validate : bool
-        Test the axioms at a few random points. Turn off where an energy is not defined at normally distributed points,
-        and use ``system.check(points=...)``.
+    momentum_maps, validate : dict of functions, or a sequence of them; bool
+        Conserved quantities of a symmetry, functions of the state; and whether to test the axioms at a few random
+        points. Use ``system.check(points=...)`` instead if an energy is not defined at normally distributed points.
 
     Raises
     ------
     AxiomError, FunctionError, InputError
+        If an axiom fails, or a function or an argument does not fit.
 
     Attributes
     ----------
     poisson : manifolds.ExtendedPhaseSpace
         ``poisson.state_indices`` has the indices of all q, p and S in a state.
-    subsystems : tuple of Subsystem or Copies
-    names : tuple of str
-        Of the bodies.
+    subsystems, names : tuple of Subsystem or Copies, tuple of str
+        The bodies and their names.
     """
 
     poisson: mf.ExtendedPhaseSpace
