@@ -12,7 +12,7 @@ import scipy.integrate
 
 import liethermo as lt
 import manifolds as mf
-from liethermo.learn.data import Trajectory, component_and_time_scales
+from liethermo.learn.data import Trajectory, compute_data_scales
 
 from . import learned_peers
 from .report import Report, Table
@@ -126,7 +126,7 @@ def compare_models(problem: Problem, is_quick: bool) -> list[list]:
     count = max(1, len(x) // 5)
     half = round(problem.t_end / problem.step) + 1
     test, train = x[:count], [Trajectory(np.arange(half) * problem.step, states[:half]) for states in x[count:]]
-    scales = component_and_time_scales(train)
+    scales = compute_data_scales(train)
     steps, width, seeds = (50, 8, 1) if is_quick else (problem.steps, 32, problem.n_seeds)
     long_steps = round((2 if is_quick else LONG_RUN_FACTOR) * problem.t_end / problem.step)
     rows = []

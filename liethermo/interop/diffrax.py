@@ -84,7 +84,7 @@ class Solver(diffrax.AbstractAdaptiveSolver):
         return initial_carry(system, method, y0)[1:]
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """Take one step; if its equations are not solved, diffrax rejects the step or ends the run."""
+        """Take one step; return state, error estimate, dense output, carry, and whether its equations were solved."""
         system, method = self._system_and_method(terms)
         h = getattr(terms, "direction", 1) * (t1 - t0)  # diffrax wraps a term to reverse time
         compensation, k, previous_slopes = solver_state

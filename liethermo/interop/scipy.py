@@ -292,7 +292,7 @@ MIN_RTOL = 100.0 * float(np.finfo(np.float64).eps)
 
 
 def _smallest_tolerance(name: str, tolerance, x0) -> float:
-    """Return the smallest entry of a tolerance, a number or an array of shape (n,), to be used for all components."""
+    """Return the smallest entry of a tolerance, of shape () or (n,); entries of rtol below MIN_RTOL are raised."""
     if np.ndim(tolerance) == 0:
         return tolerance.item() if isinstance(tolerance, np.ndarray) else tolerance
     values = np.asarray(tolerance, dtype=np.float64)

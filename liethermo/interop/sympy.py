@@ -258,14 +258,14 @@ def _reference_solution(system: System, x0, t_span: tuple[float, float]) -> dict
     duration = t_span[1] - t_span[0]
     x_dop853 = integrate(system, x0, t_span, duration, Reference(rtol=1e-13), progress=False).x[-1]
     x_gauss = integrate(
-        system, x0, t_span, _accurate_step_size(system, x0, duration), MetriplecticGauss(6), progress=False
+        system, x0, t_span, _gauss_reference_step_size(system, x0, duration), MetriplecticGauss(6), progress=False
     ).x[-1]
     difference = float(np.abs(x_dop853 - x_gauss).max())
     digits = int(np.clip(-np.log10(max(difference, 1e-16)), 1, 15))
     return {"time": float(t_span[1]), "state": [round(float(x), digits) for x in x_gauss], "apart": difference}
 
 
-def _accurate_step_size(system: System, x0, duration: float) -> float:
+def _gauss_reference_step_size(system: System, x0, duration: float) -> float:
     """Return a step size for 6-stage Gauss collocation: a fifth of the time in which the state changes by its
     magnitude."""
     x = np.asarray(x0, dtype=np.float64)

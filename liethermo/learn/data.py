@@ -197,9 +197,8 @@ class DataScales(NamedTuple):
         return DataScales(centre, scale, self.time_scale)
 
 
-def component_and_time_scales(trajectories: list[Trajectory]) -> DataScales:
-    """Return the mean and standard deviation of each component over all trajectories, and the median time scale of the
-    changes."""
+def compute_data_scales(trajectories: list[Trajectory]) -> DataScales:
+    """Return mean and standard deviation of each component over all trajectories, shape (k,), and the time scale."""
     columns = [
         [_present_values_of_component(trajectory, k) for trajectory in trajectories]
         for k in range(trajectories[0].x.shape[1])
@@ -228,7 +227,7 @@ def spline_states_and_rates(trajectory: Trajectory, noise: np.ndarray | None) ->
     """
     t, x = trajectory
     if np.isnan(x).any():
-        return _splines_with_missing_values(trajectory, noise)
+        return _spline_states_with_missing_values(trajectory, noise)
     start, length = t[0], t[-1] - t[0]
     u, degree = (t - start) / length, min(SPLINE_DEGREE, len(t) - 1)
     if noise is None or degree < SPLINE_DEGREE:
@@ -241,7 +240,9 @@ def spline_states_and_rates(trajectory: Trajectory, noise: np.ndarray | None) ->
     return np.stack([f(u) for f in columns], axis=1), np.stack([f.derivative()(u) for f in columns], axis=1) / length
 
 
-def _splines_with_missing_values(trajectory: Trajectory, noise: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+def _spline_states_with_missing_values(
+    trajectory: Trajectory, noise: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
     """Fit splines to components with missing values; return their values and derivatives at all times, shape (m, k).
 
     Before its first value and after its last one, a component is constant.

@@ -80,7 +80,7 @@ def soap_optimiser(array_shapes: Sequence[tuple[int, ...]], learning_rate: Calla
         step = _rotate_matrices(step, matrices, [[(Q.T, S) for Q, S in pair] for pair in bases_and_means])
 
         def update_bases(_):
-            return [[_update_eigenvectors(count, Q, S) for (Q, _), S in zip(pair, gram_means, strict=True)]
+            return [[_update_eigenbasis(count, Q, S) for (Q, _), S in zip(pair, gram_means, strict=True)]
                     for pair, gram_means in zip(bases_and_means, means, strict=True)]  # fmt: skip
 
         def keep_bases(_):
@@ -105,6 +105,7 @@ def _rotate_matrices(vector: jax.Array, matrix_slices: Sequence, basis_pairs: Se
     return vector
 
 
-def _update_eigenvectors(n_steps: jax.Array, Q: jax.Array, S: jax.Array) -> jax.Array:
-    """Return the eigenvectors of S: exact at step 0, then by one step of orthogonal iteration from Q."""
-    return jax.lax.cond(n_steps == 0, lambda: jnp.linalg.eigh(S)[1][:, ::-1], lambda: jnp.linalg.qr(S @ Q)[0])
+def _update_eigenbasis(step_index: jax.Array, basis: jax.Array, gram_mean: jax.Array) -> jax.Array:
+    """Return eigenvectors of ``gram_mean``, shape (n, n): exact at step 0, then iterated from ``basis``."""
+    exact_basis = lambda: jnp.linalg.eigh(gram_mean)[1][:, ::-1]  # noqa: E731
+    return jax.lax.cond(step_index == 0, exact_basis, lambda: jnp.linalg.qr(gram_mean @ basis)[0])

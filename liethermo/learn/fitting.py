@@ -22,7 +22,7 @@ from ..units import quantity_in_si
 from . import losses
 from .data import (
     Trajectory,
-    component_and_time_scales,
+    compute_data_scales,
     cut_windows,
     estimate_noise_levels,
     parse_trajectories,
@@ -212,7 +212,7 @@ def fit(
     n_substeps = 1 if substeps is None else substeps
     prepared_system = losses.differentiable_stepper(model, method, n_substeps, observation.group is not None).system
     trajectories = [trajectory.flat_trajectory for trajectory in parse_trajectories(data, model, observation)]
-    data_scale = component_and_time_scales(trajectories)
+    data_scale = compute_data_scales(trajectories)
     sigma = checked_noise_std(noise, data_scale.scale.size)
     noise_is_estimated = noise is None
     noise_levels = None
@@ -398,7 +398,7 @@ def prepare_system_and_parameters(
             raise InputError(f"fit needs a system such as lt.learn.Metriplectic(4), got {type(system).__name__}{hint}")
         if positive is not None and not callable(positive):
             raise InputError(f"positive must be a function of the system if parameters= is not given, got {positive!r}")
-        return system, None, lambda system: losses.parameter_vector(system, also, positive)
+        return system, None, lambda system: losses.learned_parameter_vector(system, also, positive)
     if also is not None:
         raise InputError("also= and parameters= cannot be combined. Name all parameters to fit in parameters=")
     values = initial_parameter_values(system, parameters)

@@ -18,7 +18,7 @@ from ..integrators import OneStepMethod
 from ..runs.integrate import integrate
 from ..systems import System
 from . import losses
-from .data import Trajectory, component_and_time_scales, estimate_noise_if_visible, parse_trajectories
+from .data import Trajectory, compute_data_scales, estimate_noise_if_visible, parse_trajectories
 from .fitting import checked_noise_std, fit, prepare_system_and_parameters
 from .observation import make_observation
 from .training import FitWarning
@@ -107,7 +107,7 @@ def determined(
     InputError
         If nothing is learned.
     """
-    params = losses.parameter_vector(system, also, positive)
+    params = losses.learned_parameter_vector(system, also, positive)
     if not params.initial_values.size:
         raise InputError(
             "the system has nothing to learn. Give it parts of lt.learn, or name parameters with also= or positive="
@@ -240,7 +240,7 @@ def several(
 def _given_or_estimated_noise_std(trajectories: list[Trajectory], noise) -> np.ndarray | None:
     """Return the standard deviations of the measurement noise, given or estimated; None if no noise is visible."""
     flat_trajectories = [trajectory.flat_trajectory for trajectory in trajectories]
-    scale = component_and_time_scales(flat_trajectories).scale
+    scale = compute_data_scales(flat_trajectories).scale
     return (
         estimate_noise_if_visible(flat_trajectories, scale) if noise is None else checked_noise_std(noise, scale.size)
     )

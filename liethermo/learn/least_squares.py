@@ -101,7 +101,7 @@ class LeastSquaresProblem(NamedTuple):
 def fit_by_least_squares(
     problem: LeastSquaresProblem, noise: np.ndarray | None, noise_levels: NoiseLevels | None, substeps: int | None
 ) -> LeastSquaresFit:
-    """Fit parameters to trajectories by multiple shooting and least squares, from their initial values.
+    """Fit parameters to trajectories by multiple shooting and least squares; return a :class:`LeastSquaresFit`.
 
     Least squares over whole trajectories have many minima if the guess is off by more than half a period at their ends.
     So the first runs are short, each from its own initial state, and each stage has runs four times as long (multiple
@@ -169,7 +169,7 @@ def fit_by_least_squares(
         noise, units = new_noise, problem.units_for_noise(new_noise)
         result = refine(result.weights, result.states, whole_runs, units, n_substeps)
     if noise_levels is not None and noise is not None:
-        result = result._replace(residual=_rms_residual_over_noise(noise, noise_levels, n_observed))
+        result = result._replace(residual=_rms_ratio_to_estimated_noise(noise, noise_levels, n_observed))
     return LeastSquaresFit(result._replace(iterations=n_iterations), noise)
 
 
@@ -198,12 +198,14 @@ def _split_into_segments(runs: PaddedRuns, n_times_per_segment: int) -> list[Tra
     return segments
 
 
-def _rms_residual_over_noise(residuals: np.ndarray, noise_levels: NoiseLevels, n_observed: np.ndarray) -> float:
-    """Return the root mean square of residuals divided by the estimated noise; 1 if there is no estimate.
+def _rms_ratio_to_estimated_noise(
+    residual_stds: np.ndarray, noise_levels: NoiseLevels, n_observed: np.ndarray
+) -> float:
+    """Return the root mean square of the ratios of residual to estimated noise; 1 if there is no estimate.
 
     Where the differences show no noise but bound it, residuals below the bound count as noise.
     """
-    ratio = residuals / noise_levels.std
+    ratio = residual_stds / noise_levels.std
     ratio = np.where(noise_levels.is_noise, ratio, np.maximum(ratio, 1.0))
     if not noise_levels.is_bound.any():
         return 1.0

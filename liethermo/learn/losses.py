@@ -51,9 +51,10 @@ class ParameterVector(NamedTuple):
     parameters_of: Callable[[Any], dict[str, Any] | None] = lambda vector: None
 
 
-def parameter_vector(system: System, also: Callable | None = None, positive: Callable | None = None) -> ParameterVector:
-    """Return the learned parameters of a system: arrays marked by :class:`Learned`, and those that two functions
-    choose."""
+def learned_parameter_vector(
+    system: System, also: Callable | None = None, positive: Callable | None = None
+) -> ParameterVector:
+    """Return the learned parameters of a system: arrays marked by :class:`Learned`, or chosen by two functions."""
     mask = learned_mask(system)
     if isinstance(system.poisson, Poisson) and system.poisson.entropy is not None:
         mask = eqx.tree_at(lambda m: m.poisson.entropy, mask, False)  # the same weights as in the entropy

@@ -163,7 +163,7 @@ def read_data(
     for group in dict.fromkeys(groups.tolist()):
         rows = groups == group
         trajectory_name = "the data" if group_label is None else f"trajectory {group}"
-        trajectories.append(_checked_trajectory(trajectory_name, t[rows], x[rows], names, group_label is None))
+        trajectories.append(_checked_table_trajectory(trajectory_name, t[rows], x[rows], names, group_label is None))
     return Records(names, tuple(trajectories))
 
 
@@ -232,7 +232,7 @@ class _Labels:
                 return self.units[name]
         return split_label(label)[1]
 
-    def parse_unit(self, label: str):
+    def column_unit(self, label: str):
         """Return the :class:`.Unit` of a column.
 
         Raises
@@ -266,7 +266,7 @@ def _time_column(values: np.ndarray, labels: _Labels, label: str) -> np.ndarray:
         if np.isnat(values).any():
             raise InputError(f"the times {labels.names[label]!r} have missing values. Remove these rows")
         return (values - values[0]) / np.timedelta64(1, "ns") * 1e-9
-    unit = labels.parse_unit(label)
+    unit = labels.column_unit(label)
     if unit.dimension not in (TIME, ()):
         raise InputError(
             f"the times {labels.names[label]!r} are in {labels.unit_text(label)!r}. Give a unit of time, as 's'"
@@ -276,7 +276,7 @@ def _time_column(values: np.ndarray, labels: _Labels, label: str) -> np.ndarray:
 
 def _value_column(values: np.ndarray, labels: _Labels, label: str) -> np.ndarray:
     """Convert a column of observations to SI units; raise InputError if it has no values or some are not numbers."""
-    column = labels.parse_unit(label).to_si(_to_floats(values, label))
+    column = labels.column_unit(label).to_si(_to_floats(values, label))
     if np.isnan(column).all():
         raise InputError(f"column {labels.names[label]!r} has no values, only missing ones. Remove it with columns=")
     return column
@@ -305,7 +305,7 @@ def _converts_to_float(value: Any) -> bool:
     return True
 
 
-def _checked_trajectory(
+def _checked_table_trajectory(
     trajectory_name: str, t: np.ndarray, x: np.ndarray, names: Sequence[str], is_only_trajectory: bool
 ) -> Trajectory:
     """Return a trajectory made of the rows of a table that have values, after checking them.

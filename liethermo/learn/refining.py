@@ -210,7 +210,7 @@ class RunModel:
         """Return states displaced by tangent coordinates, both with one row for each state."""
         return np.asarray(self._displace(jnp.asarray(states), jnp.asarray(displacements)))
 
-    def predict(
+    def predict_with_derivatives(
         self,
         weights: np.ndarray,
         runs: PaddedRuns,
@@ -278,14 +278,14 @@ class NormalEquations(NamedTuple):
     column_costs: np.ndarray
 
     @property
-    def costs(self) -> np.ndarray:
+    def segment_costs(self) -> np.ndarray:
         """Sum of the squared residuals of each segment, shape (segments,)."""
         return self.column_costs.sum(axis=1)
 
     @property
     def is_finite(self) -> np.ndarray:
         """True for segments whose residuals and derivatives are finite, shape (segments,)."""
-        return np.isfinite(self.costs) & np.isfinite(self.matrices).all(axis=(1, 2))
+        return np.isfinite(self.segment_costs) & np.isfinite(self.matrices).all(axis=(1, 2))
 
 
 def _normal_equations(
@@ -318,7 +318,7 @@ def refine_by_least_squares(
     tolerance: float = NEWTON_STEP_TOLERANCE,
     max_iterations: int = MAX_ITERATIONS,
 ) -> LeastSquaresResult:
-    """Minimise the sum of squared residuals of runs over the weights and the initial states of the segments.
+    """Minimise the squared residuals of runs over weights and initial states; return a :class:`LeastSquaresResult`.
 
     The method is Levenberg-Marquardt. Each initial state affects one segment only, so the normal equations of the
     weights are a Schur complement. Initial states of held-out trajectories are fitted too, without effect on the
@@ -346,7 +346,9 @@ def refine_by_least_squares(
     n_weights, is_log = len(weights), model.params.is_log
 
     def evaluate(weights, states) -> NormalEquations:
-        return _normal_equations(*model.predict(weights, runs, states, segments, substeps), runs, segments, units)
+        return _normal_equations(
+            *model.predict_with_derivatives(weights, runs, states, segments, substeps), runs, segments, units
+        )
 
     weights, states = np.asarray(weights, dtype=np.float64), np.asarray(runs.states)
     initial_weights = model.params.initial_values
@@ -357,11 +359,11 @@ def refine_by_least_squares(
     degrees_of_freedom = _degrees_of_freedom(
         n_observations, equations.matrices[:, n_weights:, n_weights:], is_training, n_weights
     )
-    variance = equations.costs[is_training].sum() / max(degrees_of_freedom, 1)
+    variance = equations.segment_costs[is_training].sum() / max(degrees_of_freedom, 1)
     exact_variance = EXACT_RTOL**2 * np.mean((runs.observations / units[0]) ** 2)
     while iterations < max_iterations and damping < MAX_DAMPING:
         matrices_with_prior = _add_initial_state_prior(equations.matrices, n_weights, variance)
-        schur, _ = _schur_complement(matrices_with_prior, equations.gradients, n_weights, is_training)
+        schur, _ = _eliminate_initial_states(matrices_with_prior, equations.gradients, n_weights, is_training)
         newton = _gauss_newton_step(matrices_with_prior, equations.gradients, n_weights, is_training, 0.0)
         newton_step_norm = np.sqrt(max(newton @ schur @ newton, 0.0) / variance) if variance > 0.0 else 0.0
         is_converged = bool(newton_step_norm <= tolerance or variance <= exact_variance)
@@ -375,7 +377,7 @@ def refine_by_least_squares(
         new_weights, new_states = weights + step, states.copy()
         new_states[starts] = model.displace(states[starts], displacements * search_unit)
         new_equations = evaluate(new_weights, new_states)
-        new_costs, costs = new_equations.costs, equations.costs
+        new_costs, costs = new_equations.segment_costs, equations.segment_costs
         is_finite = new_equations.is_finite
         if is_finite[is_training].all() and new_costs[is_training].sum() <= costs[is_training].sum():
             is_invalid = ~is_finite & ~is_training  # runs held out that leave the domain stay as they were
@@ -388,8 +390,8 @@ def refine_by_least_squares(
             break
         else:
             damping *= DAMPING_INCREASE
-    matrices, gradients, costs = equations.matrices, equations.gradients, equations.costs
-    schur, slope = _schur_complement(
+    matrices, gradients, costs = equations.matrices, equations.gradients, equations.segment_costs
+    schur, slope = _eliminate_initial_states(
         _add_initial_state_prior(matrices, n_weights, variance), gradients, n_weights, is_training
     )
     total_cost = costs[is_training].sum()
@@ -397,7 +399,7 @@ def refine_by_least_squares(
     inverse, _, condition = _inverse_rank_and_condition(schur)
     weight_diagonal = np.diag(matrices[is_training].sum(axis=0))[:n_weights]  # with the first states known
     inverse_without_prior, rank, _ = _inverse_rank_and_condition(
-        _schur_complement(matrices, gradients, n_weights, is_training)[0], weight_diagonal
+        _eliminate_initial_states(matrices, gradients, n_weights, is_training)[0], weight_diagonal
     )
     if rank < n_weights:  # the prior alone determines the rest
         inverse, condition = np.where(np.isinf(inverse_without_prior), np.inf, inverse), np.inf
@@ -465,7 +467,7 @@ def _pseudo_inverse(normal_matrix: np.ndarray, damping: float = 0.0) -> np.ndarr
     return np.linalg.pinv(scaled_matrix, rcond=SCHUR_RTOL, hermitian=True) * np.outer(scale, scale)
 
 
-def _schur_complement(
+def _eliminate_initial_states(
     normal_matrices, gradients, n_weights: int, is_training, damping: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Eliminate the initial states from the normal equations; return the normal matrix and the gradient of the
@@ -480,7 +482,7 @@ def _schur_complement(
 
 def _gauss_newton_step(normal_matrices, gradients, n_weights: int, is_training, damping: float) -> np.ndarray:
     """Return the damped Gauss-Newton step of the weights, shape (p,)."""
-    matrix, gradient = _schur_complement(normal_matrices, gradients, n_weights, is_training, damping)
+    matrix, gradient = _eliminate_initial_states(normal_matrices, gradients, n_weights, is_training, damping)
     return -_pseudo_inverse(matrix, damping) @ gradient
 
 

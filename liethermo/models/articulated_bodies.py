@@ -205,7 +205,7 @@ class ArticulatedBodies(Module):
         sums = jnp.asarray(self._bodies_moved_by_link) @ inertias
         return SpatialInertias(sums[:, 0], sums[:, 1:4], sums[:, 4:].reshape(-1, 3, 3))
 
-    def screws(self, poses: Poses) -> jax.Array:
+    def base_and_joint_screws(self, poses: Poses) -> jax.Array:
         """Return the screw axes of all velocities: six of a free base, angular ones first, then one of each joint."""
         return jnp.concatenate([jnp.eye(6)[: self._n_base_screws], poses.joint_screws])
 
@@ -225,9 +225,9 @@ class ArticulatedBodies(Module):
         return entries + jnp.where(is_below & ~np.eye(len(links), dtype=bool), entries, 0.0).T
 
     def _inertia_matrix_at(self, q) -> jax.Array:
-        """Return :meth:`_inertia_matrix` at joint coordinates q."""
+        """Return the inertia matrix H of the velocities along all screws, shape (n, n), at joint coordinates q."""
         poses = self.poses(q)
-        return self._inertia_matrix(self.screws(poses), self.composite_inertias(poses))
+        return self._inertia_matrix(self.base_and_joint_screws(poses), self.composite_inertias(poses))
 
     def mass_matrix(self, q) -> jax.Array:
         """Return the mass matrix M(q) of the kinetic energy ``(Omega, q') . M(q) (Omega, q') / 2``, shape (3 + k, 3 +
@@ -271,7 +271,7 @@ class ArticulatedBodies(Module):
         """Return the momenta along all screws, for an angular momentum Pi, joint momenta p and no linear momentum."""
         return p if self.is_fixed else jnp.concatenate([Pi, jnp.zeros(3), p])
 
-    def motion(self, Pi, q, p) -> Motion:
+    def motion_from_momenta(self, Pi, q, p) -> Motion:
         """Return the velocities for an angular momentum Pi and joint momenta p; see :class:`Motion`.
 
         On the ground Pi does not count.
@@ -284,7 +284,7 @@ class ArticulatedBodies(Module):
         are rounded to eps of the square roots of its diagonal, before the free joints lower it.
         """
         poses, b = self.poses(q), self._n_base_screws
-        composites, screws = self.composite_inertias(poses), self.screws(poses)
+        composites, screws = self.composite_inertias(poses), self.base_and_joint_screws(poses)
         # behind barriers: otherwise XLA computes both again for each of their uses
         H = jax.lax.optimization_barrier(self._inertia_matrix(screws, composites))
         steps = _eliminate_velocities(H, self._momenta_along_screws(Pi, p))
@@ -459,14 +459,14 @@ def _kinetic_energy(kinetic: KineticEnergy, x) -> jax.Array:
 
 @jit_if_traced
 def _kinetic_gradient(kinetic: KineticEnergy, x) -> jax.Array:
-    motion = kinetic.mechanism.motion(*kinetic.split_state(x))
+    motion = kinetic.mechanism.motion_from_momenta(*kinetic.split_state(x))
     velocity = [] if kinetic.mechanism.is_fixed else [motion.angular_velocity]
     return jnp.concatenate([*velocity, motion.joint_gradient, motion.joint_rates])
 
 
 @jit_if_traced
 def _kinetic_rounding_scale(kinetic: KineticEnergy, x) -> jax.Array:
-    return kinetic.mechanism.motion(*kinetic.split_state(x)).rounding_scale
+    return kinetic.mechanism.motion_from_momenta(*kinetic.split_state(x)).rounding_scale
 
 
 class WeightPotential(Energy):
@@ -586,20 +586,20 @@ class JointDamping(Dissipation):
         return Indices(0)
 
     @property
-    def _momenta_along_screws(self) -> slice:
+    def _joint_momentum_slice(self) -> slice:
         """Slice of the joint momenta in a state."""
         k = self.coefficients.shape[0]
         return slice(self.first_joint_index + k, self.first_joint_index + 2 * k)
 
     def force(self, system, x, dH, dS, dL):
         return (
-            jnp.zeros_like(dH).at[self._momenta_along_screws].set(-self.coefficients * dH[self._momenta_along_screws])
+            jnp.zeros_like(dH).at[self._joint_momentum_slice].set(-self.coefficients * dH[self._joint_momentum_slice])
         )
 
     def added_attitude_velocity(self, system, x, dH, dS, dL):
         return jnp.zeros_like(dH)
 
     def factor(self, system, x, dH, dL):
-        root, momenta = jnp.sqrt(self.coefficients), self._momenta_along_screws
+        root, momenta = jnp.sqrt(self.coefficients), self._joint_momentum_slice
         momentum_rates = lambda w: jnp.zeros_like(x).at[momenta].set(root * w)  # noqa: E731
         return Factor(root.shape[0], momentum_rates, True, added_attitude_velocity=lambda w: jnp.zeros_like(x))

@@ -334,7 +334,7 @@ class IdealMixture(Module):
         return jnp.sum(N * (self.capacity * self.temperature(S, N, V) + self.energy))
 
     def entropy_at(self, T, N, V):
-        """Return the entropy S at a temperature."""
+        """Return the entropy S of N particles, shape (species,), at a temperature T in a volume V."""
         return jnp.sum(N * (self.capacity * jnp.log(T) + self.entropy - jnp.log(N / V)))
 
     def equilibrium_constant(self, T, stoichiometry) -> jax.Array:
@@ -415,7 +415,7 @@ def porous_piston(
 def porous_piston_state(
     left: tuple[float, float], right: tuple[float, float], q: float = 1.0, T: float = 1.0, **parameters
 ) -> np.ndarray:
-    """Return the state of a porous piston at rest at q, with the piston at temperature T.
+    """Return the state, shape (7,), of a porous piston at rest at q, with the piston at temperature T.
 
     Parameters
     ----------

@@ -97,7 +97,7 @@ def checked_inertia(inertia, allow_rod: bool = False) -> np.ndarray | jax.Array:
 def warn_of_impossible_moments(moments: np.ndarray) -> None:
     """Warn if moments of inertia, shape (..., 3), violate the triangle inequalities, as no rigid body has them."""
     rows = moments.reshape(-1, 3)
-    is_impossible = ~_which_satisfy_triangle_inequalities(rows)
+    is_impossible = ~_triangle_inequalities_mask(rows)
     if not is_impossible.any():
         return
     row = rows[int(np.argmax(is_impossible))]
@@ -133,8 +133,8 @@ def _allowed_moments_mask(moments):
     return ((moments > 0.0) | (is_rod & (moments == 0.0))) & (moments < np.inf)
 
 
-def _are_tensors_of_bodies(tensors):
-    """Return True for each symmetric positive definite tensor, shape (..., 3, 3)."""
+def _valid_tensors_mask(tensors):
+    """Return a mask, shape (...), of the tensors, shape (..., 3, 3), that are symmetric and positive definite."""
     xp = np if isinstance(tensors, np.ndarray) else jnp
     asymmetry = xp.abs(tensors - xp.swapaxes(tensors, -1, -2)).max(axis=(-2, -1))
     is_symmetric = asymmetry <= SYMMETRY_RTOL * xp.abs(tensors).max(axis=(-2, -1))
@@ -144,7 +144,7 @@ def _are_tensors_of_bodies(tensors):
 INERTIA_CONDITION = ParameterCondition(
     _allowed_moments_mask,
     POSITIVE_MOMENTS_TEXT,
-    _are_tensors_of_bodies,
+    _valid_tensors_mask,
     "a tensor of inertia must be symmetric and positive definite, got {value}",
 )
 """Condition on the moments or the tensor of inertia of a body."""
@@ -293,10 +293,10 @@ def are_symmetric_to_rounding(matrices: np.ndarray) -> bool:
 
 def satisfies_triangle_inequalities(moments: np.ndarray) -> bool:
     """Return True if moments of shape (..., 3) obey ``I_i <= I_j + I_k``, as the moments of every rigid body do."""
-    return bool(_which_satisfy_triangle_inequalities(moments).all())
+    return bool(_triangle_inequalities_mask(moments).all())
 
 
-def _which_satisfy_triangle_inequalities(moments: np.ndarray) -> np.ndarray:
-    """Return True for each triple of moments, shape (..., 3), that a rigid body can have; False if one is NaN."""
+def _triangle_inequalities_mask(moments: np.ndarray) -> np.ndarray:
+    """Return a mask, shape (...), of the moments, shape (..., 3), that a rigid body can have; False if one is NaN."""
     max_moments = moments.max(axis=-1)
     return max_moments <= (moments.sum(axis=-1) - max_moments) * (1.0 + INEQUALITY_RTOL)

@@ -192,7 +192,7 @@ def _mass_matrices(mechanism: ArticulatedBodies, q) -> jax.Array:
 @jit_unoptimised
 def _motions(mechanism: ArticulatedBodies, x) -> Motion:
     kinetic = KineticEnergy(mechanism)
-    return jax.vmap(lambda y: mechanism.motion(*kinetic.split_state(y)))(x)
+    return jax.vmap(lambda y: mechanism.motion_from_momenta(*kinetic.split_state(y)))(x)
 
 
 def _entries_of_joint(values, start: int, end: int):

@@ -244,7 +244,7 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         given_vectors = [v for v in (angular_velocity, momentum) if v is not None]
         vector = checked_vectors(given_vectors[0] if given_vectors else np.zeros(3), name)
         vector, q, rates, *translation = broadcast_batches(
-            vector, q, rates, *self._translation_components(centre_of_mass, velocity)
+            vector, q, rates, *self._centre_of_mass_components(centre_of_mass, velocity)
         )
         M = self.mass_matrix(q)
         if momentum is None:
@@ -258,7 +258,7 @@ class JointedBodies(TreeSystem, LiePoissonSystem):
         x = append_bath_entropies(x, self.baths, temperature)
         return super().state(x, x.ndim > 1)
 
-    def _translation_components(self, centre_of_mass, velocity) -> tuple[jax.Array, ...]:
+    def _centre_of_mass_components(self, centre_of_mass, velocity) -> tuple[jax.Array, ...]:
         """Return the components of a state for the position and momentum of the centre of mass; none without a
         position."""
         if self._centre_of_mass_index is None:

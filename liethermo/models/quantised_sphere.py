@@ -74,11 +74,11 @@ class QuantisedSphere:
 
     def laplacian(self, mu) -> jax.Array:
         """Return the state of the Laplacian ``Delta W`` of a vorticity, shape (..., N^2 - 1)."""
-        return self._apply_to_diagonals(mu, self._apply_tridiagonal)
+        return self._apply_to_diagonals(mu, self._laplacian_of_diagonals)
 
     def inverse_laplacian(self, mu) -> jax.Array:
         """Solve ``Delta P = W`` and return the state of the traceless P, shape (..., N^2 - 1)."""
-        return self._apply_to_diagonals(mu, self._solve_tridiagonal)
+        return self._apply_to_diagonals(mu, self._inverse_laplacian_of_diagonals)
 
     def _apply_to_diagonals(self, mu, function) -> jax.Array:
         """Apply a function to the main and upper diagonals of a state, and return the state of the result.
@@ -122,14 +122,16 @@ class QuantisedSphere:
         )
         return entry_sources, entry_factors, component_sources, component_factors
 
-    def _apply_tridiagonal(self, diagonals) -> jax.Array:
+    def _laplacian_of_diagonals(self, diagonals) -> jax.Array:
+        """Return the diagonals, shape (..., N, 2, N), of the Laplacian of the matrix with the given diagonals."""
         main, off_diagonal = self._tridiagonal_coefficients
         up = jnp.pad(diagonals[..., 1:, :, :], [(0, 0)] * (diagonals.ndim - 3) + [(0, 1), (0, 0), (0, 0)])
         down = jnp.pad(diagonals[..., :-1, :, :], [(0, 0)] * (diagonals.ndim - 3) + [(1, 0), (0, 0), (0, 0)])
         lower_diagonal = np.pad(off_diagonal[:-1], [(1, 0), (0, 0)])
         return -(main[:, None] * diagonals + off_diagonal[:, None] * up + lower_diagonal[:, None] * down)
 
-    def _solve_tridiagonal(self, diagonals) -> jax.Array:
+    def _inverse_laplacian_of_diagonals(self, diagonals) -> jax.Array:
+        """Return the diagonals, shape (..., N, 2, N), of the traceless matrix whose Laplacian has given diagonals."""
         ratio, inverse = self._ldl_factors
         diagonals = jnp.moveaxis(-diagonals, -3, 0)  # the scans run along all diagonals at once
 

@@ -80,8 +80,8 @@ class RotorFriction(Damping):
     rate: jax.Array = eqx.field(metadata=RATE_CONDITION.metadata)
     axis: jax.Array
 
-    def _momentum_rate(self, x, sigma) -> jax.Array:
-        torque = jnp.cross(x[:3], sigma)
+    def _momentum_rate(self, x, velocity) -> jax.Array:
+        torque = jnp.cross(x[:3], velocity)
         return jnp.append(torque, jnp.dot(self.axis, torque))
 
     def force(self, system, x, dH, dS, dL):
@@ -327,7 +327,7 @@ def _rotor_system(inertia, axes, rotors, make_dissipation, baths, attitude, torq
     """
     inverse = inverse_inertia(checked_inertia(inertia, allow_rod=True))
     inverse = jnp.diag(inverse) if inverse.ndim == 1 else inverse
-    a = _unit_axes(axes)  # as columns
+    a = _unit_axis_columns(axes)  # as columns
     n = a.shape[1]
     J = jnp.broadcast_to(checked_numbers(rotors, "the moment of the rotor", (), (n,)), (n,))
     J = checked_positive(J, "the moment of the rotor", n)
@@ -349,7 +349,7 @@ def _rotor_system(inertia, axes, rotors, make_dissipation, baths, attitude, torq
     return LiePoissonSystem(algebra, Quadratic(A), dissipation=dissipation, group=group, baths=baths, torque=torque)
 
 
-def _unit_axes(axes) -> jax.Array:
+def _unit_axis_columns(axes) -> jax.Array:
     """Normalise directions, shape (3,) or (k, 3), and return them as columns, shape (3, k)."""
     checked_numbers(axes, "axis")
     directions = np.atleast_2d(np.asarray(axes, dtype=float))

@@ -59,7 +59,7 @@ def sorting_flow(target, rate=1.0) -> LiePoissonSystem:
     algebra = mf.u(len(entries))
     gradient = algebra.vee(-1j * np.diag(entries))
     return LiePoissonSystem(
-        algebra, Linear(gradient), dissipation=DoubleBracket(checked_rate(rate), 1.0 / _squared_norms(algebra))
+        algebra, Linear(gradient), dissipation=DoubleBracket(checked_rate(rate), 1.0 / _basis_squared_norms(algebra))
     )
 
 
@@ -114,11 +114,11 @@ def hermitian_matrix(x) -> jax.Array:
     """
     state = jnp.asarray(x)
     algebra = mf.u(round(state.shape[-1] ** 0.5))
-    return -1j * jnp.einsum("...a,aij->...ij", state / _squared_norms(algebra), algebra.basis)
+    return -1j * jnp.einsum("...a,aij->...ij", state / _basis_squared_norms(algebra), algebra.basis)
 
 
-def _squared_norms(algebra: mf.LieAlgebra) -> np.ndarray:
-    """Return ``tr(e_a^H e_a)`` of each basis element of u(n), which are orthogonal."""
+def _basis_squared_norms(algebra: mf.LieAlgebra) -> np.ndarray:
+    """Return ``tr(e_a^H e_a)`` of each element of the orthogonal basis of u(n), shape (n**2,)."""
     basis = algebra._require_basis()
     gram = np.einsum("aij,bij->ab", basis.conj(), basis).real
     assert np.allclose(gram, np.diag(np.diag(gram))), "the basis of u(n) is orthogonal"

@@ -88,7 +88,7 @@ def moving_thermo_particles(
     dimension : int
         Dimension of the space; the state is (q_1, p_1, S_1, q_2, …), q_a and p_a with ``dimension`` components.
     """
-    bodies = _moving_bodies(masses, capacities, dimension, 0.0)
+    bodies = _moving_subsystems(masses, capacities, dimension, 0.0)
     axis_vectors = np.eye(2 * dimension + 1)[dimension:-1]
     momentum_vectors = {"momentum" if dimension == 1 else f"momentum {i + 1}": p for i, p in enumerate(axis_vectors)}
     constants = {
@@ -123,7 +123,7 @@ def thermo_springs(
     """
     k, is_frictionless = checked_positive(stiffness, "stiffness"), isinstance(friction, float | int) and friction == 0.0
     return ComposedSystem(
-        _moving_bodies(masses, capacities, 1, friction),
+        _moving_subsystems(masses, capacities, 1, friction),
         coupling=Quadratic(k * np.array([[1.0, -1.0], [-1.0, 1.0]])).on([0, 3]),
         conductance=conductance,
         drag=drag,
@@ -132,7 +132,7 @@ def thermo_springs(
     )
 
 
-def _moving_bodies(masses, capacities, dimension, friction) -> list[Subsystem]:
+def _moving_subsystems(masses, capacities, dimension, friction) -> list[Subsystem]:
     c = checked_positive_vector(capacities, "capacities")
     m, n = checked_positive(masses, "masses", len(c)), checked_integer(dimension, "dimension")
     return [

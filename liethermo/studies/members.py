@@ -82,11 +82,11 @@ def system_builder(
             raise InputError(f"build must be a system, or a function that returns one, got {build!r:.60}")
         return build
     return functools.partial(
-        _replace_parameter_entries, build, {name: _parameter_name_and_index(build, name) for name in parameter_names}
+        _replace_parameter_entries, build, {name: _split_entry_name(build, name) for name in parameter_names}
     )
 
 
-def _parameter_name_and_index(system: System, entry_name: str) -> tuple[str, tuple[int, ...]]:
+def _split_entry_name(system: System, entry_name: str) -> tuple[str, tuple[int, ...]]:
     """Split a name such as ``energy.inertia[0]`` into the name of a parameter of the system and the index of an entry.
 
     Raises
@@ -171,7 +171,7 @@ class StudySystems:
         """Build and return the system at one point; its constructors check the parameters."""
         return require_system(self._call_builder(to_python_values(point)), "the builder must return a system")
 
-    def inadmissible_points(self, points: PointParameters, n_points: int) -> dict[int, str]:
+    def why_points_inadmissible(self, points: PointParameters, n_points: int) -> dict[int, str]:
         """Return an error message, by index, for each point whose parameters violate a condition of the constructors;
         needs a family."""
         return self._conditions(points, n_points) if self._parameters else {}

@@ -167,7 +167,7 @@ class PointSolver:
         """
         self._noise_seeds = noise_seeds
         failure_messages: dict[int, str] = (
-            {} if self.systems.family is None else self.systems.inadmissible_points(points, n_points)
+            {} if self.systems.family is None else self.systems.why_points_inadmissible(points, n_points)
         )
         x0s, attitudes = initial_states, None
         if self._x0 is not None:

@@ -28,9 +28,9 @@ from .solve import EMPTY_POINT_STATUS, LAW_QUANTITIES, STATUSES, SUCCESS_CODES
 from .store_metadata import (
     MAX_CHUNKS,
     ZarrArray,
-    coordinate_arrays,
+    coordinate_arrays_and_values,
+    describe_point_arrays,
     parse_group_metadata,
-    point_arrays,
     with_checksum,
 )
 
@@ -101,13 +101,13 @@ class StudyStore:
             Attributes of the group.
         """
         chunk_shape = _chunk_shape(axes.shape, points_per_chunk)
-        arrays = point_arrays(axes.names, axes.shape, chunk_shape, measures, array_attributes)
+        arrays = describe_point_arrays(axes.names, axes.shape, chunk_shape, measures, array_attributes)
         if (n_chunks := math.prod(arrays["status"].chunk_grid)) > MAX_CHUNKS:
             raise InputError(
                 f"{axes.size} points in chunks of {points_per_chunk} need {n_chunks} files, which are too many. "
                 "Use a larger chunk"
             )
-        arrays |= {array.name: array for array, _ in coordinate_arrays(axes, array_attributes)}
+        arrays |= {array.name: array for array, _ in coordinate_arrays_and_values(axes, array_attributes)}
         store = cls(root, arrays, attributes)
         partial_root = root.with_name(disk.partial_file_name(root.name))
         try:
@@ -157,7 +157,7 @@ class StudyStore:
         arrays = dict(self.arrays)
         for name in self.chunked_array_names:
             arrays[name] = replace(arrays[name], shape=axes.shape + arrays[name].shape[len(axes.shape) :])
-        for array, _ in coordinate_arrays(axes, {}):
+        for array, _ in coordinate_arrays_and_values(axes, {}):
             arrays[array.name] = replace(arrays[array.name], shape=array.shape, dtype=array.dtype)
         store = replace(self, arrays=arrays)
         store._write_metadata(axes)
@@ -186,7 +186,7 @@ class StudyStore:
         """Write the coordinate files, then the metadata of the arrays, and finally the group metadata, which readers
         open first."""
         self.attributes["coordinates"] = _coordinates_checksum(axes)
-        coordinates = {array.name: values for array, values in coordinate_arrays(axes, {})}
+        coordinates = {array.name: values for array, values in coordinate_arrays_and_values(axes, {})}
         for name, values in {"quantity": np.array(LAW_QUANTITIES), **coordinates}.items():
             array = self.arrays[name]
             for index in np.ndindex(*array.chunk_grid):
@@ -385,7 +385,7 @@ def _slices_within_chunk(array_slices: Sequence[slice]) -> tuple[slice, ...]:
 def _coordinates_checksum(axes: Axes) -> str:
     """Return the SHA-256 digest of the coordinates of all axes, in order."""
     digest = hashlib.sha256()
-    for array, values in coordinate_arrays(axes, {}):
+    for array, values in coordinate_arrays_and_values(axes, {}):
         digest.update(json.dumps([array.name, values.shape, values.tolist()]).encode())
     return digest.hexdigest()
 

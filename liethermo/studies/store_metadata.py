@@ -161,7 +161,7 @@ def _crc32c(data: bytes) -> int:
     return google_crc32c.value(data)
 
 
-def point_arrays(
+def describe_point_arrays(
     axis_names: tuple[str, ...],
     shape: tuple[int, ...],
     chunks: tuple[int, ...],
@@ -187,7 +187,7 @@ def point_arrays(
     return {**arrays, "quantity": ZarrArray("quantity", ("quantity",), (n_quantities,), (n_quantities,), "string")}
 
 
-def coordinate_arrays(
+def coordinate_arrays_and_values(
     axes: Axes, array_attributes: Mapping[str, Mapping[str, Any]]
 ) -> Iterator[tuple[ZarrArray, np.ndarray]]:
     """Yield, for each coordinate of the axes, the description of its array and its values."""
@@ -241,7 +241,7 @@ def parse_group_metadata(root: Path, group_metadata: dict[str, Any]) -> tuple[di
         raise ValueError(f"no study has points in shape {status.shape} and chunks {status.chunks}")
     array_attributes = {name: array.attributes for name, array in arrays.items()}
     values = {name: (arrays[name].shape[len(axes) :], arrays[name].dtype) for name in measures}
-    expected_arrays = point_arrays(tuple(axes), status.shape, status.chunks, values, array_attributes)
+    expected_arrays = describe_point_arrays(tuple(axes), status.shape, status.chunks, values, array_attributes)
     for (axis_name, column_names), length in zip(axes.items(), status.shape, strict=True):
         for name in (axis_name, *column_names, *({f"{axis_name}_state"} & set(arrays))):
             array = arrays[name]

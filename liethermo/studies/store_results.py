@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 def load_status(path: Any) -> StudyStatus:
     """Return the progress of a study, with the number of points by status, read from the path of its store."""
-    return store_status(StudyStore.open(checked_path(path)))
+    return status_of_store(StudyStore.open(checked_path(path)))
 
 
-def store_status(store: StudyStore) -> StudyStatus:
+def status_of_store(store: StudyStore) -> StudyStatus:
     """Return the progress of the study in an open store, with the number of points by status."""
     counts, running = store.status_counts(), store_metadata.active_run_record(store.root)
     n_done = store.n_points - counts.get("missing", 0)

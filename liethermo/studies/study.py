@@ -33,7 +33,7 @@ from .progress import StudyProgressBar, StudyStatus
 from .running import solve_chunks_locally, solve_chunks_on_cluster
 from .solve import MEASURE_FAILED, STATUSES, PointResults, PointSolver, StudyTask, describe_error
 from .store import STORE_FORMAT, StoreSurvey, StudyStore
-from .store_results import audit_store, load_status, open_results, store_status
+from .store_results import audit_store, load_status, open_results, status_of_store
 
 if TYPE_CHECKING:
     import xarray
@@ -227,7 +227,7 @@ class Study(metaclass=ListedType):
                     self._solve_remaining(store, axes, survey, progress_bar, client)
             except KeyboardInterrupt:
                 is_interrupted = True
-        return dataclasses.replace(store_status(store), damaged=survey.damaged, interrupted=is_interrupted)
+        return dataclasses.replace(status_of_store(store), damaged=survey.damaged, interrupted=is_interrupted)
 
     def _solve_remaining(
         self, store: StudyStore, axes: Axes, survey: StoreSurvey, progress_bar: StudyProgressBar, client: Any
@@ -354,7 +354,7 @@ class Study(metaclass=ListedType):
         first_failure, n_failed = "", 0
         for index in candidates:
             seeds = None if self._task.noise is None else self._task.noise.grid_seeds([np.array([i]) for i in index])
-            reason, was_built = self._try_to_solve_example(*_point_and_state_at(axes, index), seeds)
+            reason, was_built = self._solve_example_or_explain(*_point_and_state_at(axes, index), seeds)
             if self._example is not None and not reason:
                 self._example_index = index
                 return self._example
@@ -371,11 +371,11 @@ class Study(metaclass=ListedType):
         numbers = dict.fromkeys(int(size * _van_der_corput(k)) for k in range(MAX_CANDIDATE_POINTS))
         return [tuple(map(int, np.unravel_index(number, shape))) for number in numbers]
 
-    def _try_to_solve_example(
+    def _solve_example_or_explain(
         self, point: dict[str, Any], states: np.ndarray | None, seeds: np.ndarray | None
     ) -> tuple[str, bool]:
-        """Solve one point as the example of the study; return an error message, or "", and True if its system could be
-        built."""
+        """Solve one point as the example of the study; return an error message, or "", and whether its
+        system was built."""
         self._example = None
         self._check_axes_are_used(point)
         try:

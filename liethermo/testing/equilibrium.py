@@ -169,7 +169,7 @@ def sample_equilibrium_measure(
     if not invariants:
         covariance_root = np.linalg.cholesky(1.5 * np.cov(path_states.reshape(-1, n).T).reshape(n, n))
         points, centre = directions @ covariance_root.T, path_states.reshape(-1, n).mean(axis=0)
-        log_weights = _log_density(system, noise, points + centre) + 0.5 * np.sum(directions**2, axis=1)
+        log_weights = _equilibrium_log_density(system, noise, points + centre) + 0.5 * np.sum(directions**2, axis=1)
         return Samples(points + centre, np.exp(log_weights - log_weights.max()))
     (name, F), level = next(iter(invariants.items())), jnp.asarray(x0, dtype=float)
     curvature = np.asarray(jax.hessian(F.value)(jnp.zeros(n)))
@@ -180,7 +180,7 @@ def sample_equilibrium_measure(
     if not (np.isfinite(radius) & (slope > 0.0)).all():
         raise ValueError(f"rays from the origin do not meet the level of {name} once. Give samples of the measure")
     points = radius[:, None] * directions
-    log_weights = _log_density(system, noise, points) + (n - 1) * np.log(radius) - np.log(slope)
+    log_weights = _equilibrium_log_density(system, noise, points) + (n - 1) * np.log(radius) - np.log(slope)
     return Samples(points, np.exp(log_weights - log_weights.max()))
 
 
@@ -207,7 +207,7 @@ def _level_distance_and_slope(function_and_level_state: tuple[Energy, jax.Array]
     return jnp.stack([jnp.where(is_before_level(outer_radius), jnp.nan, 0.5 * (inner_end + outer_end)), slope])
 
 
-def _log_density(system: System, noise: Fluctuations, points: np.ndarray) -> np.ndarray:
+def _equilibrium_log_density(system: System, noise: Fluctuations, points: np.ndarray) -> np.ndarray:
     """Return the logarithm of the equilibrium density at each point, shape (m,), up to a constant."""
     log_density = np.zeros(len(points))
     if noise.temperature is not None:

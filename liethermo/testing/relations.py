@@ -38,10 +38,10 @@ from .transformations import (
     CoordinateChange,
     UncoupledPair,
     add_constant,
+    dissipation_in_two_halves,
     hide_parameters_in_closures,
     replace_system_attributes,
     restrict_function_to_neighbourhood,
-    split_dissipation_into_halves,
     transform_coordinates_and_units,
 )
 
@@ -114,7 +114,7 @@ def check_dissipation_split_into_halves(case: RelationCase) -> SkipReason:
     """Check that a run does not change if the dissipation is a sum of two with half of the rate each."""
     if case.system.dissipation is None:
         return "there is no dissipation"
-    run = case.run(replace_system_attributes(case.system, dissipation=split_dissipation_into_halves(case.system)))
+    run = case.run(replace_system_attributes(case.system, dissipation=dissipation_in_two_halves(case.system)))
     case.compare_with_base_run("half of the rate, twice", run)
     rows, split_rows = ([row.law for row in s.audit().rows] for s in (case.base_run, run))
     case.suite.check_true(

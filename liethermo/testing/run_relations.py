@@ -36,7 +36,7 @@ def check_run_split_in_time(case: RelationCase) -> SkipReason:
     if not split_times:
         return "there are too few steps"
     tolerance = case.discretisation_tolerance if isinstance(case.step, Adaptive) else case.rounding_tolerance
-    last_segment = run_in_segments(case, split_times)
+    last_segment = last_segment_of_split_run(case, split_times)
     case.compare_states_with_expected(
         f"in {len(split_times) + 1} parts", last_segment.x[-1], case.base_run.x[-1], tolerance
     )
@@ -53,7 +53,7 @@ def times_to_split_run(case: RelationCase) -> list[float]:
     return [float(case.base_run.t[i]) for i in sorted({count // 8, count // 2}) if 0 < i < count]
 
 
-def run_in_segments(case: RelationCase, split_times: list[float], **options) -> Solution:
+def last_segment_of_split_run(case: RelationCase, split_times: list[float], **options) -> Solution:
     """Integrate in consecutive time segments, each from the final state of the one before; return the last segment."""
     run: Solution | None = None
     attitude: dict[str, Any] = {}
@@ -79,7 +79,7 @@ def check_noise_of_split_run(case: RelationCase) -> SkipReason:
         return str(error)
     if not unsplit_run.status.ok:
         return f"the run with noise ends: {unsplit_run.status.message}"
-    last_segment = run_in_segments(case, split_times, noise=noise)
+    last_segment = last_segment_of_split_run(case, split_times, noise=noise)
     unsplit_states = unsplit_run.x[-len(last_segment.x) :]
     case.compare_states_with_expected(
         "in parts", last_segment.x, unsplit_states, case.rounding_tolerance if case.system.is_driven else 0.0

@@ -312,17 +312,17 @@ def check_dissipation(dissipation: Dissipation | System, algebra: mf.LieAlgebra 
     return suite.report()
 
 
-def _system_with_dissipation(dissipation: Dissipation, g: mf.LieAlgebra) -> LiePoissonSystem:
-    quadratic = g.casimirs(2)
+def _system_with_dissipation(dissipation: Dissipation, algebra: mf.LieAlgebra) -> LiePoissonSystem:
+    quadratic = algebra.casimirs(2)
     if not quadratic:
-        raise ValueError(f"{g.name} has no quadratic Casimir. Give a system that has the dissipation")
-    weights = np.linspace(1.0, 2.0, g.dim)
+        raise ValueError(f"{algebra.name} has no quadratic Casimir. Give a system that has the dissipation")
+    weights = np.linspace(1.0, 2.0, algebra.dim)
 
     def energy(mu):
         return 0.5 * jnp.sum(weights * mu * mu) + 0.1 * jnp.cos(mu[0] + 0.5 * mu[-1])
 
-    entropy = np.sum([jax.hessian(F)(jnp.zeros(g.dim)) for F in quadratic], axis=0)
-    return LiePoissonSystem(g, energy, Quadratic(entropy), dissipation)
+    entropy = np.sum([jax.hessian(F)(jnp.zeros(algebra.dim)) for F in quadratic], axis=0)
+    return LiePoissonSystem(algebra, energy, Quadratic(entropy), dissipation)
 
 
 MIN_ORDER_ERROR = 1e-12

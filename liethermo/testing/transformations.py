@@ -171,7 +171,7 @@ class _LocalFunction(Module):
 
 
 def add_constant(energy: Energy, constant: float) -> Energy:
-    """Return an energy plus a constant; its last term takes up the constant."""
+    """Return the sum of an energy and a constant, which is added to the last term of the energy."""
     *leading_terms, last_term = energy.terms
     if isinstance(last_term, Quadratic):
         last_term = Quadratic(last_term.A, last_term.b, last_term.c + constant)
@@ -228,7 +228,7 @@ class _ScaledDissipation(LiftedDissipation):
         return None if sigma is None else self.fraction * sigma
 
 
-def split_dissipation_into_halves(system: System) -> Dissipation:
+def dissipation_in_two_halves(system: System) -> Dissipation:
     """Return the dissipation of a system as the sum of two dissipations with half of the rate each."""
     rate = named_parameters(system).get("dissipation.rate")
     if rate is not None:
