@@ -431,19 +431,19 @@ def copy_entropy_to_poisson(system: T) -> T:
     return eqx.tree_at(lambda s: s.poisson, system, set_poisson_entropy(system.poisson, system.entropy))
 
 
-def scale_networks(system: T, scales: DataScales, points: np.ndarray) -> T:
+def scale_networks(system: T, data_scales: DataScales, states: np.ndarray) -> T:
     """Return the system with the scales of its networks set from the data, so that inputs and outputs are of order one.
 
     Networks that have scales already are not changed.
 
     Parameters
     ----------
-    scales : DataScales
+    data_scales : DataScales
         Scales of the data.
-    points : array, shape (m, n)
+    states : array, shape (m, n)
         Some states.
     """
-    x, s, tau = jnp.asarray(points), jnp.asarray(scales.scale), scales.time_scale
+    x, s, tau = jnp.asarray(states), jnp.asarray(data_scales.scale), data_scales.time_scale
 
     def mean_variation(function: AnyEnergy) -> float:
         """Return the mean over the data of the change of a function over one standard deviation of the state."""

@@ -319,7 +319,7 @@ def normalised_associated_legendre(m: int, max_degree: int, theta: np.ndarray) -
     return np.stack(columns, axis=1)
 
 
-class KineticEnergy(Energy):
+class FluidKineticEnergy(Energy):
     """The kinetic energy of a fluid on the sphere times gamma, ``gamma / 2 tr(W^H (-Delta)^{-1} W)``."""
 
     sphere: QuantisedSphere = eqx.field(static=True)
@@ -389,7 +389,7 @@ def zeitlin(N: int, decay: Literal["enstrophy", "energy"] | None = None, rate=0.
         dissipation = DoubleBracket(2.0 * sphere.gamma * rate)
     return LiePoissonSystem(
         sphere.algebra,
-        KineticEnergy(sphere),
+        FluidKineticEnergy(sphere),
         Quadratic(np.full(sphere.algebra.dim, -2.0)),
         dissipation,
         validate=False,  # the axioms hold by construction, and testing Jacobi would take O(N^6)
