@@ -147,6 +147,20 @@ def test_a_constant_does_not_hide_a_drift():
     assert (row.passed, "in all it falls by 0.04" in row.note) == (False, True)
 
 
+@pytest.mark.parametrize(
+    ("residual", "relative_fall", "passed"),
+    [(0.0, 1e-13, False), (2e-13, 1e-13, True), (2e-13, 1e-12, False), (1e-3, 1e-13, True), (1e-3, 1e-11, False)],
+)
+def test_the_entropy_may_fall_by_the_residual_of_a_step(residual, relative_fall, passed):
+    """A residual above its own tolerance excuses no more than one at the tolerance."""
+    solution = lt.integrate(rigid_body(), [0.1, 0.2, 1.0], (0.0, 1.0), 0.1)
+    fall = relative_fall * solution.evidence.entropy
+    stats = dataclasses.replace(solution.stats, worst_residual=residual, least_entropy_increment=-fall)
+    audit = dataclasses.replace(solution, stats=stats).audit()
+    assert only_row(audit, "least entropy increment").passed is passed
+    assert only_row(audit, "stage residual").passed is (residual <= 1e-12)
+
+
 def test_the_size_of_a_function():
     x = np.array([3.0, 4.0])
     norm = lt.Function(lambda x: jnp.log(x @ x) - jnp.log(25.0) + 1e10)
