@@ -213,8 +213,7 @@ def problem_report(name: str, is_quick: bool) -> Report:
     columns |= {"MAE, T to 2 T": "error", "Energy drift": "error", "Least entropy increment": "error"}
     columns |= {"Training": "seconds"}
     caption = (
-        f"{p.n_trajectories} trajectories to T = {p.t_end:g}, a fifth of them for the test, {p.steps} steps of "
-        "256 points. Means "
-        f"over {p.n_seeds} seed{'s' if p.n_seeds > 1 else ''}."
+        f"The data are {p.n_trajectories} trajectories to T = {p.t_end:g}, a fifth of them for the test. Training has "
+        f"{p.steps} steps of 256 points. The table has means over {p.n_seeds} seed{'s' if p.n_seeds > 1 else ''}."
     )
     return Report(f"Learned: {p.title}", p.text, [Table(caption, columns, compare_models(p, is_quick))])

@@ -42,9 +42,9 @@ print(
 )
 
 # %%
-# The box seen from outside, and its angular momentum. The momentum is fixed, and the box turns about it. At first the
-# middle edge is along the momentum, in the end the shortest edge. The initial state decides which end of that edge is
-# ahead.
+# The figure shows the box from outside, with its angular momentum. The momentum is fixed, and the box turns about it.
+# At first the middle edge is along the momentum, in the end the shortest edge. The initial state decides which end
+# of that edge is ahead.
 
 corners = (
     np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) * edges / 2

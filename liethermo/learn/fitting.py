@@ -40,6 +40,7 @@ from .observation import (
 from .parameters import build_with_parameters, initial_parameter_values, named_parameter_vector
 from .parts import has_learned_parts, scale_networks
 from .refining import (
+    MAX_COLUMN_STEPS,
     MAX_PARAMETERS,
     RunModel,
     can_refine_by_least_squares,
@@ -268,8 +269,9 @@ def fit(
     if not matching and not shooting:
         if not can_be_refined:
             raise InputError(
-                f"least squares alone need at most {MAX_PARAMETERS} parameters, none of them in a network, and not too "
-                "many data. Give more than 0 iterations of the matching or the shooting"
+                f"least squares alone need at most {MAX_PARAMETERS} parameters, none of them in a network, and at most "
+                f"{MAX_COLUMN_STEPS:.0e} steps of all trajectories times parameters. Give more than 0 "
+                "iterations of the matching or the shooting"
             )
         if checkpoint is not None:
             raise InputError("checkpoint= is for the matching and the shooting, which have no iterations. Remove it")

@@ -45,8 +45,8 @@ class Tolerances:
 
     A change of a function is judged relative to the scale at which rounding acts on it, its *sensitivity*
     ``max |grad f(x)| |x|`` along the run (:meth:`liethermo.Energy.sensitivity`), whatever its value is at the start.
-    Eight roundings of the value itself are allowed besides, and of the terms that cancel in it: smaller changes cannot
-    be seen if a constant is added to the function, or in ``1 - cos q`` near q = 0.
+    Eight roundings of the value, and of the terms that cancel in it, are added to the tolerance: smaller changes are
+    lost if a constant is added to the function, or in ``1 - cos q`` near q = 0.
 
     Attributes
     ----------

@@ -81,7 +81,7 @@ def _value_at_time(function, t: float, what: str):
     try:
         inspect.signature(function).bind(t)
     except TypeError as error:
-        raise InputError(f"{what}, if it is a function, must be one of the time t alone: {error}") from None
+        raise InputError(f"the function for {what} must have one argument, the time t: {error}") from None
     except ValueError:  # the signature is not known
         pass
     return function(t)

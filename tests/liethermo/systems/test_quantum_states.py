@@ -482,8 +482,8 @@ BAD = {
     "of term 1 of the Hamiltonian must return a real number": lambda q: lt.QuantumSystem(
         [QUBIT, (X, lambda t: 1j * t)]
     ),
-    "the Hamiltonian, if it is a function, must be one of the time": lambda q: lt.QuantumSystem(lambda: QUBIT),
-    "must be one of the time t alone: missing .* 's'": lambda q: lt.QuantumSystem([QUBIT, (X, lambda t, s: t)]),
+    "the function for the Hamiltonian must have one argument": lambda q: lt.QuantumSystem(lambda: QUBIT),
+    "one argument, the time t: missing .* 's'": lambda q: lt.QuantumSystem([QUBIT, (X, lambda t, s: t)]),
     r"V\[0\] with the energy 1.3 .* = 3.39e\+27": lambda q: lt.QuantumSystem(
         QUBIT, lt.ThermalJumps([(LOWER, RATE)]), infinite(0.01)
     ),
