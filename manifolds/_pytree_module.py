@@ -26,8 +26,7 @@ class Module(eqx.Module, metaclass=ListedModuleType):
     """Equinox module whose methods are ordinary bound methods, except when they become fields of another module.
 
     Equinox makes a pytree of each method that is looked up, which takes a good part of the time to trace a step and of
-    a
-    short run. A pytree is needed only when a method becomes a field of another module, so that the parameters of its
+    a short run. A pytree is needed only when a method becomes a field of another module, so that the parameters of its
     object are parameters there.
     """
 

@@ -25,10 +25,8 @@ def rational_null_space(matrix: np.ndarray) -> list[list[int]]:
     """Return the reduced row echelon basis of the null space of an integer matrix, exact, scaled to coprime integers.
 
     The basis is computed modulo a prime, then modulo the product of two, three, … primes, until the fractions with
-    these
-    residues satisfy ``matrix @ v == 0`` in integers. No vector can then be missing: the rank modulo a prime is at most
-    the
-    rank over Q.
+    these residues satisfy ``matrix @ v == 0`` in integers. No vector can then be missing: the rank modulo a prime is at
+    most the rank over Q.
     """
     primes = map(large_prime, count())
     residues, modulus, leading_columns = np.zeros((0, 0), dtype=object), 1, None

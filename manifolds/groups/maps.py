@@ -129,12 +129,9 @@ def log(algebra: LieAlgebra, g) -> jax.Array:
     """Return the principal logarithm in components, NaN where an eigenvalue is on or next to the negative axis.
 
     The result is NaN too where the matrix logarithm is not in the algebra, as in SU(n) if the angles of the eigenvalues
-    sum
-    to 2 pi. The algorithm takes square roots until s is near I; then ``log s = 2 artanh (s - I)(s + I)^-1``, which
-    keeps to
-    the algebra of a group with a quadratic form; then one Newton step on ``exp(x) = g`` in components, which removes
-    the
-    rounding that the roots amplify.
+    sum to 2 pi. The algorithm takes square roots until s is near I; then ``log s = 2 artanh (s - I)(s + I)^-1``, which
+    keeps to the algebra of a group with a quadratic form; then one Newton step on ``exp(x) = g`` in components, which
+    removes the rounding that the roots amplify.
     """
     identity, batch = jnp.eye(g.shape[-1], dtype=g.dtype), g.shape[:-2]
 

@@ -60,8 +60,7 @@ def leading_sign(x) -> jax.Array:
     """Return the sign of the first component larger than 1e-8 of the length, shape (..., 1).
 
     A half turn has two logarithms; the one whose axis has the leading sign 1 is returned, so that rounding cannot
-    choose
-    the other. Within HALF_TURN_MARGIN of the half turn its angle may then exceed pi by as much.
+    choose the other. Within HALF_TURN_MARGIN of the half turn its angle may then exceed pi by as much.
     """
     sign, threshold = jnp.ones((*x.shape[:-1], 1)), HALF_TURN_MARGIN * jnp.sqrt(_squared_length(x))
     for i in reversed(range(x.shape[-1])):

@@ -313,8 +313,7 @@ class Space(SpaceMaps):
         """Return the length of v divided by the injectivity radius; below 1, ``log`` recovers v from ``exp(x, v)``.
 
         It is defined under tracing too, where it tells if a step stays in the domain. In a product it is the largest
-        over
-        the factors.
+        over the factors.
         """
         return self._call_compiled("_reach", *self._checked_point_and_vectors(x, v=v))
 

@@ -22,9 +22,8 @@ class SpaceMaps(metaclass=ListedABCMeta):
     """Maps of a state space as its author writes them: plain JAX functions of checked arrays.
 
     Leading axes are batches. ``name``, ``dim``, ``shape`` and ``_project`` are required; the other maps have defaults
-    that
-    follow from these, or raise an error with the reason, and may be overridden. :class:`manifolds.Space` documents the
-    public ones.
+    that follow from these, or raise an error with the reason, and may be overridden. :class:`manifolds.Space` documents
+    the public ones.
     """
 
     metric: str = "induced"
@@ -413,7 +412,7 @@ def squared_distance_with_cut_locus(space: Any, x, y):
 
 
 @squared_distance_with_cut_locus.defjvp
-def _extended_squared_distance_jvp(space, primals, tangents):
+def _squared_distance_with_cut_locus_jvp(space, primals, tangents):
     return squared_distance_with_cut_locus(space, *primals), jax.jvp(
         partial(SpaceMaps._squared_distance, space), primals, tangents
     )[1]
