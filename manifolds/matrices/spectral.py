@@ -22,7 +22,7 @@ from .linear import adjoint
 from .symmetric import eigh
 
 MAX_SPREAD_FOR_MEAN = 1 / 16
-"""Largest spread of points, relative to the length scale of a function, for which divided differences are means of
+"""Largest spread of points, relative to the width of a function, for which divided differences are means of
 derivatives.
 
 Beyond, a quotient of differences loses four bits. Up to it, the error of a mean over four nodes is rounding.
@@ -37,7 +37,7 @@ class ScalarFunction:
         """Return the derivative of an order, entry by entry; order 0 is the function itself."""
 
     @abstractmethod
-    def length_scale(self, x) -> jax.Array:
+    def width(self, x) -> jax.Array:
         """Return the distance from x to the nearest singularity, or the length over which the function changes much."""
 
     def difference_quotient(self, x, y) -> jax.Array:
@@ -63,9 +63,9 @@ class ScalarFunction:
     def _mean_or_quotient(self, *points) -> jax.Array:
         """Return a divided difference: by a mean of derivatives if the points are close, else by differences."""
         sorted_points = _sort_entrywise(points)
-        length_scale = jnp.stack([self.length_scale(x) for x in sorted_points]).min(axis=0)
+        width = jnp.stack([self.width(x) for x in sorted_points]).min(axis=0)
         gap = sorted_points[-1] - sorted_points[0]
-        use_mean = gap <= MAX_SPREAD_FOR_MEAN * length_scale
+        use_mean = gap <= MAX_SPREAD_FOR_MEAN * width
         difference = self.divided_difference(*sorted_points[1:]) - self.divided_difference(*sorted_points[:-1])
         return jnp.where(use_mean, self._simplex_mean(sorted_points, 4), difference / jnp.where(use_mean, 1.0, gap))
 
@@ -117,7 +117,7 @@ class Exp(ScalarFunction):
     def derivative(self, x, order):
         return jnp.exp(x)
 
-    def length_scale(self, x):
+    def width(self, x):
         return jnp.ones_like(x)
 
     def difference_quotient(self, x, y):
@@ -141,7 +141,7 @@ class Log(ScalarFunction):
             return jnp.log1p(x) if self.offset == 1.0 else jnp.log(self.offset + x)
         return -math.factorial(order - 1) * (-1.0 / (self.offset + x)) ** order
 
-    def length_scale(self, x):
+    def width(self, x):
         return self.offset + x
 
     def difference_quotient(self, x, y):
@@ -165,7 +165,7 @@ class Reciprocal(ScalarFunction):
     def derivative(self, x, order):
         return (-1.0) ** order * math.factorial(order) / (self.offset + x) ** (order + 1)
 
-    def length_scale(self, x):
+    def width(self, x):
         return jnp.abs(self.offset + x)
 
     def divided_difference(self, *points):
@@ -183,7 +183,7 @@ class Sqrt(ScalarFunction):
         factor = math.prod(0.5 - i for i in range(order))
         return factor * jnp.sqrt(x) / x**order if order else jnp.sqrt(x)
 
-    def length_scale(self, x):
+    def width(self, x):
         return x
 
     def difference_quotient(self, x, y):
@@ -199,7 +199,7 @@ class Derivative(ScalarFunction):
     def derivative(self, x, order):
         return self.function.derivative(x, order + 1)
 
-    length_scale = forward_to("function")
+    width = forward_to("function")
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ class GenericFunction(ScalarFunction):
             return self.function(x)
         return jax.jvp(lambda x: self.derivative(x, order - 1), (x,), (jnp.ones_like(x),))[1]
 
-    def length_scale(self, x):
+    def width(self, x):
         raise NotImplementedError
 
     def _mean_or_quotient(self, *points):
