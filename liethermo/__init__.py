@@ -10,7 +10,7 @@ import importlib.metadata
 import warnings
 
 import manifolds  # noqa: F401  (switches 64-bit mode on before anything is traced)
-from manifolds._arguments import public_dir
+from manifolds._arguments import module_dir_function
 
 from . import (
     _class_members,  # noqa: F401  (what help() lists of the classes)
@@ -254,7 +254,7 @@ _DEPRECATED_TYPES = {
 """Modules of types that only the library makes; they were public names in 0.2."""
 
 
-__dir__ = public_dir(__all__, "__version__")
+__dir__ = module_dir_function(__all__, "__version__")
 
 
 def __getattr__(name: str):

@@ -6,7 +6,7 @@ axes to axes in space [:doc:`/reference/conventions`].
 
 from __future__ import annotations
 
-from manifolds._arguments import public_dir
+from manifolds._arguments import module_dir_function
 
 from .models.bodies_on_ground import BodiesOnGround
 from .models.free_motion import Periods, damping_time, periods, rate_of
@@ -58,4 +58,4 @@ __all__ = [
     "spin",
     "write_csv",
 ]
-__dir__ = public_dir(__all__)
+__dir__ = module_dir_function(__all__)

@@ -7,7 +7,7 @@ round them away.
 import importlib
 
 from . import _fork_guard, _precision, testing  # noqa: F401
-from ._arguments import public_dir
+from ._arguments import module_dir_function
 from .algebras.blocks import DirectSum, direct_sum, power, semidirect_sum
 from .algebras.casimirs import NoPolynomialCasimirWarning, TracePolynomial
 from .algebras.catalogue import abelian, aff, bianchi, g2, galilei, gl, heisenberg, registered, se, sl, so, sp, su, u
@@ -209,7 +209,7 @@ __all__ = [
     "trilinear_form",
     "u",
 ]
-__dir__ = public_dir(__all__)
+__dir__ = module_dir_function(__all__)
 
 
 def __getattr__(name: str):

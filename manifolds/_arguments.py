@@ -50,6 +50,6 @@ def component_names(names: tuple[str, ...] | None, dim: int) -> tuple[str, ...]:
     return tuple(f"mu{i + 1}" for i in range(dim)) if names is None else names
 
 
-def public_dir(names, *extra: str) -> Callable[[], list[str]]:
+def module_dir_function(names, *extra: str) -> Callable[[], list[str]]:
     """Return the ``__dir__`` function of a module: it lists public names only, without imported modules."""
     return lambda: sorted({*names, *extra, "__doc__", "__name__"})

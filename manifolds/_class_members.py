@@ -68,8 +68,8 @@ declare_class_members(
 )
 
 
-def listed_names(cls: type) -> list[str]:
-    """Return the names of a class that ``help()`` lists, in alphabetical order."""
+def names_listed_by_help(cls: type) -> list[str]:
+    """Return the names of the members that ``help()`` of a class lists, in alphabetical order."""
     names, has_entry = dict[str, None](), False
     for base in cls.__mro__:
         package = base.__module__.partition(".")[0]
@@ -94,7 +94,7 @@ class ListedType(type):
     """
 
     def __dir__(cls) -> list[str]:
-        return listed_names(cls)
+        return names_listed_by_help(cls)
 
 
 class ListedABCMeta(ListedType, ABCMeta):

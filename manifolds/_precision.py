@@ -29,7 +29,7 @@ _saved_user_settings: ContextVar[tuple[Any, ...] | None] = ContextVar("asked", d
 
 @contextlib.contextmanager
 def library_settings() -> Iterator[None]:
-    """Context manager that runs library code under LIBRARY_SETTINGS.
+    """Run the library code in a ``with`` block under LIBRARY_SETTINGS.
 
     Raises
     ------
@@ -42,7 +42,7 @@ def library_settings() -> Iterator[None]:
         return
     token = _saved_user_settings.set(user_values)
     try:
-        with _apply_settings(LIBRARY_SETTINGS):
+        with _temporary_settings(LIBRARY_SETTINGS):
             yield
     finally:
         _saved_user_settings.reset(token)
@@ -67,14 +67,14 @@ def _checked_settings() -> tuple[Any, ...]:
 
 @contextlib.contextmanager
 def user_settings() -> Iterator[None]:
-    """Context manager that restores the user's settings while a function of the user runs."""
+    """Restore the user's settings in a ``with`` block, in which a function of the user runs."""
     user_values = _saved_user_settings.get()
     if user_values is None:
         yield
         return
     token = _saved_user_settings.set(None)
     try:
-        with _apply_settings(user_values):
+        with _temporary_settings(user_values):
             yield
     finally:
         _saved_user_settings.reset(token)
@@ -94,7 +94,8 @@ def with_library_settings(function: F) -> F:
 
 
 @contextlib.contextmanager
-def _apply_settings(settings: tuple[Any, ...]) -> Iterator[None]:
+def _temporary_settings(settings: tuple[Any, ...]) -> Iterator[None]:
+    """Set the JAX settings, in the order of LIBRARY_SETTINGS, inside a ``with`` block."""
     rank_promotion, dtype_promotion, debug_infs = settings
     with (
         jax.numpy_rank_promotion(rank_promotion),

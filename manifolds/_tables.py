@@ -53,7 +53,7 @@ def text_table(rows: Iterable[TableRow], headings: tuple[str, str, str], footer:
     lines = [f"{headings[0]:<{width}}  {headings[1]:>10}  {headings[2]:>9}"]
     for row in rows:
         *name_lines, name = wrap_lines(row.name, width, "  ")
-        value_text, limit_text = value_and_limit(row)
+        value_text, limit_text = value_and_limit_texts(row)
         line = f"{name:<{width}}  {value_text:>10}  {limit_text:>9}  {VERDICT_TEXTS[row.passed]:<5}"
         one_line = f"{line} {row.note}".rstrip()
         fits_on_page = len(one_line) <= PAGE_WIDTH
@@ -65,7 +65,7 @@ def text_table(rows: Iterable[TableRow], headings: tuple[str, str, str], footer:
     return "\n".join([*lines, *wrap_lines(footer, PAGE_WIDTH)])
 
 
-def value_and_limit(row: TableRow) -> tuple[str, str]:
+def value_and_limit_texts(row: TableRow) -> tuple[str, str]:
     """Return the texts of the measured value and of its limit; counts are whole numbers."""
     value_text = str(row.value) if isinstance(row.value, int) else f"{row.value:.2e}"
     if row.allowed is None or row.passed is None:
@@ -87,7 +87,7 @@ def html_table(rows: Iterable[TableRow], headings: tuple[str, str, str], footer:
     cells = [
         (
             row.name,
-            *value_and_limit(row),
+            *value_and_limit_texts(row),
             VERDICT_TEXTS[row.passed],
             row.note,
         )

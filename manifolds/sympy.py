@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import sympy
 
-from ._arguments import component_names, public_dir
+from ._arguments import component_names, module_dir_function
 from .algebras.lie_algebra import LieAlgebra
 from .algebras.polynomial import Formula, Polynomial
 from .errors import ComponentError, ShapeError
 
 __all__ = ["algebra", "expression", "polynomial", "structure_constants", "symbols"]
-__dir__ = public_dir(__all__)
+__dir__ = module_dir_function(__all__)
 
 
 def symbols(dim: int, names: Sequence[str] | None = None) -> tuple[sympy.Symbol, ...]:

@@ -16,7 +16,7 @@ import manifolds as mf
 from manifolds._arrays import is_traced
 from manifolds._pytree_module import replace_fields
 from manifolds.matrices.linear import adjoint
-from manifolds.matrices.spectral import log_mean
+from manifolds.matrices.spectral import apply_log_mean
 
 from ..errors import InputError
 from ..functions.bath_energy import BathEnergy, BodyBathsEnergy, ReservoirEnergy
@@ -394,7 +394,7 @@ def apply_jump_friction(rho, log_rho, dS, V, shift, bath_terms) -> jax.Array:
     if bath_terms is not None:
         commutators = commutators - bath_terms
     boltzmann_factors = jnp.exp(shift)[:, None, None]
-    return rho @ V / boltzmann_factors - boltzmann_factors * (V @ rho) + log_mean(log_rho, shift, commutators)
+    return rho @ V / boltzmann_factors - boltzmann_factors * (V @ rho) + apply_log_mean(log_rho, shift, commutators)
 
 
 def _stack_jump_operators(jumps: tuple[Jump, ...]) -> np.ndarray:

@@ -11,7 +11,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 
-from manifolds._arguments import public_dir
+from manifolds._arguments import module_dir_function
 
 from ..errors import InputError
 from ..functions.checks import trace_energies
@@ -21,7 +21,7 @@ from ..runs.flow import differentiable_step, initial_carry
 from ..systems import System
 
 __all__ = ["Solver", "Term"]
-__dir__ = public_dir(__all__)
+__dir__ = module_dir_function(__all__)
 
 
 class Term(diffrax.ODETerm):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from manifolds._arguments import public_dir
+from manifolds._arguments import module_dir_function
 from manifolds.errors import warn
 
 from ..errors import InputError
@@ -30,7 +30,7 @@ from ..systems.kind_checks import require_system
 from ..tracing.short_form import callable_name
 
 __all__ = ["OdeResult", "solve_ivp"]
-__dir__ = public_dir(__all__)
+__dir__ = module_dir_function(__all__)
 
 SCIPY_STATUS = {"completed": 0, "event": 1}
 """SciPy's status codes by status name; every other status is -1."""

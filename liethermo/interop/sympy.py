@@ -19,7 +19,7 @@ import numpy as np
 import sympy
 
 import manifolds as mf
-from manifolds._arguments import public_dir
+from manifolds._arguments import module_dir_function
 
 from .. import disk
 from ..errors import InputError
@@ -30,7 +30,7 @@ from ..tracing.program import Program
 from ..tracing.scalarize import scalarize
 
 __all__ = ["Expressions", "describe", "expressions", "function", "write"]
-__dir__ = public_dir(__all__)
+__dir__ = module_dir_function(__all__)
 
 PROBLEM_FORMAT = "liethermo-problem-1"
 """Value of ``format`` in the description of a problem."""

@@ -1,6 +1,6 @@
 """Fit parameters and neural networks of systems to data; both laws hold by construction before, during and after."""
 
-from manifolds._arguments import public_dir
+from manifolds._arguments import module_dir_function
 
 from .files import load, save
 from .fitting import fit
@@ -30,4 +30,4 @@ __all__ = [
     "save",
     "several",
 ]
-__dir__ = public_dir(__all__)
+__dir__ = module_dir_function(__all__)

@@ -5,7 +5,7 @@ A function ``model_solution`` in the module of a model returns the exact solutio
 
 from __future__ import annotations
 
-from manifolds._arguments import public_dir
+from manifolds._arguments import module_dir_function
 
 from .body_with_wheels import body_with_wheels
 from .gases import IdealMixture, cylinder, gas_piston, mass_spring_gas, porous_piston, reaction_vessel
@@ -49,4 +49,4 @@ __all__ = [
     "tumbling_body",
     "zeitlin",
 ]
-__dir__ = public_dir(__all__)
+__dir__ = module_dir_function(__all__)

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from manifolds._arguments import public_dir
+from manifolds._arguments import module_dir_function
 from manifolds._arrays import is_traced
 from manifolds._pytree_module import Module
 
@@ -51,7 +51,7 @@ __all__ = [
     "Tabulated",
     "Thrusters",
 ]
-__dir__ = public_dir(__all__)
+__dir__ = module_dir_function(__all__)
 
 SOLAR_PRESSURE = 4.56e-6
 """Pressure of sunlight on a black surface at one astronomical unit from the sun (N / m^2)."""

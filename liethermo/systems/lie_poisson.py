@@ -299,7 +299,7 @@ def _default_reconstruction(group: mf.MatrixGroup) -> str:
     """Return the reconstruction that conserves spatial momenta, or else the cheapest that stays in the group."""
     if group.cayley_is_adjoint():
         return "cayley"
-    return next(kind for kind, map_ in _RECONSTRUCTION_MAPS.items() if kind == "exp" or group._is_map_in_group(map_))
+    return next(kind for kind, map_ in _RECONSTRUCTION_MAPS.items() if kind == "exp" or group._has_map_into_group(map_))
 
 
 @memoize

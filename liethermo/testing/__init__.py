@@ -5,7 +5,7 @@ Each ``check_*`` tests an object as the registered ones are tested. It returns a
 :mod:`manifolds.testing`.
 """
 
-from manifolds._arguments import public_dir
+from manifolds._arguments import module_dir_function
 from manifolds.testing import PropertyError, Report
 
 from .equilibrium import check_equilibrium
@@ -22,4 +22,4 @@ __all__ = [
     "check_relations",
     "check_system",
 ]
-__dir__ = public_dir(__all__)
+__dir__ = module_dir_function(__all__)

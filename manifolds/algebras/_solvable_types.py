@@ -187,8 +187,8 @@ def _polynomial_gcd(p: Coefficients, q: Coefficients) -> Coefficients:
     return [c / p[0] for c in p]
 
 
-def ratio_or_zero(value: float, scale: float) -> float:
-    """Return ``value / scale``, exactly 0 where that is zero, and an integer where it is one to rounding."""
+def snapped_ratio(value: float, scale: float) -> float:
+    """Return ``value / scale``, replaced by the nearest integer, such as 0, if it equals that to 1e-12."""
     ratio = value / scale
     nearest = float(round(ratio))
     return nearest if math.isclose(ratio, nearest, rel_tol=0.0, abs_tol=1e-12) else ratio
@@ -220,7 +220,7 @@ def solvable_type(work: WorkingConstants, nilradical: np.ndarray) -> Summand:
         matrices = [
             _ad_matrix_on_quotient(work, x, nilradical, derived_ideal).astype(np.float64) for x in complement_rows
         ]
-        return _first_clear_type(
+        return _type_by_generic_combination(
             matrices, _type_of_plane_acting_on_heisenberg if len(derived_ideal) else _type_of_plane_acting_on_abelian
         )
     raise LieAlgebraError(f"{work.name} has a solvable summand with a nilradical of dimension {len(nilradical)}")
@@ -251,13 +251,13 @@ def _max_abs_eigenvalue(blocks: list[JordanBlock]) -> float:
     return max(abs(block.eigenvalue) for block in blocks)
 
 
-def _normalize_by_largest(values: list[float]) -> tuple[float, ...]:
+def _canonical_ratios_to_largest(values: list[float]) -> tuple[float, ...]:
     """Return real values divided by one of largest size, without it: the descending list that is largest."""
     top = max(map(abs, values))
     candidates = []
     for i, value in enumerate(values):
         if abs(value) > top * (1.0 - 1e-9):
-            ratios = [ratio_or_zero(other, value) for j, other in enumerate(values) if j != i]
+            ratios = [snapped_ratio(other, value) for j, other in enumerate(values) if j != i]
             candidates.append(tuple(sorted(ratios, reverse=True)))
     return max(candidates)
 
@@ -277,17 +277,17 @@ def _type_of_line_acting_on_abelian(blocks: list[JordanBlock]) -> Summand:
     values = [block.eigenvalue.real for block in real]
     sizes = tuple(block.size for block in real)
     if set(sizes) == {1}:
-        return _type_of_diagonal_action(_normalize_by_largest(values))
+        return _type_of_diagonal_action(_canonical_ratios_to_largest(values))
     head = values[0]
     if len(values) == 1:
         return ({2: "A3,2", 3: "A4,4", 4: "A5,12"}[sizes[0]], ())
     if sizes == (2, 2):
-        return _make_summand("A5,15", a=_normalize_by_largest(values)[0])
+        return _make_summand("A5,15", a=_canonical_ratios_to_largest(values)[0])
     if is_zero(head, scale):
         if sizes == (2, 1, 1):
-            return _make_summand("A5,8", c=_normalize_by_largest(values[1:])[0])
+            return _make_summand("A5,8", c=_canonical_ratios_to_largest(values[1:])[0])
         return ({2: "A4,3", 3: "A5,10"}[sizes[0]], ())
-    ratios = sorted((ratio_or_zero(value, head) for value in values[1:]), reverse=True)
+    ratios = sorted((snapped_ratio(value, head) for value in values[1:]), reverse=True)
     if sizes == (2, 1):
         return _make_summand("A4,2", a=ratios[0])
     if sizes == (3, 1):
@@ -310,18 +310,18 @@ def _type_of_rotation_and_real_blocks(pair: JordanBlock, real: list[JordanBlock]
     re, im = pair.eigenvalue.real, pair.eigenvalue.imag
     values = [block.eigenvalue.real for block in real]
     if len(values) == 1 and real[0].size == 1:
-        candidates = [(ratio_or_zero(re, sign * im), ratio_or_zero(values[0], sign * im)) for sign in (1, -1)]
+        candidates = [(snapped_ratio(re, sign * im), snapped_ratio(values[0], sign * im)) for sign in (1, -1)]
         b, a = max(candidates)
         return _make_summand("A4,6", a=a, b=b)
     if len(values) == 1:
         scale = max(abs(pair.eigenvalue), abs(values[0]))
         if is_zero(values[0], scale):
-            return _make_summand("A5,14", p=abs(ratio_or_zero(re, im)))
-        return _make_summand("A5,16", p=ratio_or_zero(re, values[0]), s=abs(ratio_or_zero(im, values[0])))
+            return _make_summand("A5,14", p=abs(snapped_ratio(re, im)))
+        return _make_summand("A5,16", p=snapped_ratio(re, values[0]), s=abs(snapped_ratio(im, values[0])))
     candidates_13 = []
     for value, other in (values, values[::-1]):
         if abs(value) > abs(other) * (1.0 - 1e-9):
-            candidates_13.append((ratio_or_zero(other, value), ratio_or_zero(re, value), abs(ratio_or_zero(im, value))))
+            candidates_13.append((snapped_ratio(other, value), snapped_ratio(re, value), abs(snapped_ratio(im, value))))
     a, p, s = max(candidates_13)
     return _make_summand("A5,13", a=a, p=p, s=s)
 
@@ -329,9 +329,9 @@ def _type_of_rotation_and_real_blocks(pair: JordanBlock, real: list[JordanBlock]
 def _type_of_rotations(pairs: list[JordanBlock]) -> Summand:
     """Return the type for an action on an abelian nilradical whose eigenvalues are complex pairs only."""
     if len(pairs) == 1 and pairs[0].size == 2:
-        return _make_summand("A5,18", p=abs(ratio_or_zero(pairs[0].eigenvalue.real, pairs[0].eigenvalue.imag)))
+        return _make_summand("A5,18", p=abs(snapped_ratio(pairs[0].eigenvalue.real, pairs[0].eigenvalue.imag)))
     if len(pairs) == 1:
-        p = abs(ratio_or_zero(pairs[0].eigenvalue.real, pairs[0].eigenvalue.imag))
+        p = abs(snapped_ratio(pairs[0].eigenvalue.real, pairs[0].eigenvalue.imag))
         return ("A3,6", ()) if is_zero(p) else _make_summand("A3,7", a=p)
     candidates = []
     for pair_1, pair_2 in (pairs, pairs[::-1]):
@@ -340,7 +340,7 @@ def _type_of_rotations(pairs: list[JordanBlock]) -> Summand:
             for sign in (1, -1):
                 scale = sign * z.imag
                 candidates.append(
-                    (ratio_or_zero(z.real, scale), ratio_or_zero(w.real, scale), ratio_or_zero(w.imag, z.imag))
+                    (snapped_ratio(z.real, scale), snapped_ratio(w.real, scale), snapped_ratio(w.imag, z.imag))
                 )
     p, q, s = max(candidates)
     return _make_summand("A5,17", p=p, q=q, s=s)
@@ -354,9 +354,9 @@ def _type_of_line_acting_on_heisenberg(blocks: list[JordanBlock]) -> Summand:
     if blocks[0].size == 2:
         return ("A4,7", ())
     if blocks[0].is_complex:
-        a = abs(ratio_or_zero(blocks[0].eigenvalue.real, blocks[0].eigenvalue.imag))
+        a = abs(snapped_ratio(blocks[0].eigenvalue.real, blocks[0].eigenvalue.imag))
         return ("A4,10", ()) if is_zero(a) else _make_summand("A4,11", a=a)
-    b = _normalize_by_largest([block.eigenvalue.real for block in blocks])[0]
+    b = _canonical_ratios_to_largest([block.eigenvalue.real for block in blocks])[0]
     return ("A4,8", ()) if is_zero(b + 1.0) else _make_summand("A4,9", b=b)
 
 
@@ -374,7 +374,7 @@ def _type_of_line_acting_on_heisenberg_plus_line(
     plane_moves_line = len(with_line) < len(plane) + 1
     if plane[0].is_complex:
         z = plane[0].eigenvalue
-        p, b = max((ratio_or_zero(z.real, sign * z.imag), ratio_or_zero(line, sign * z.imag)) for sign in (1, -1))
+        p, b = max((snapped_ratio(z.real, sign * z.imag), snapped_ratio(line, sign * z.imag)) for sign in (1, -1))
         return _make_summand("A5,26", p=p, eps=1) if line_moves_centre else _make_summand("A5,25", b=b, p=p)
     scale = max(_max_abs_eigenvalue(plane), abs(line))
     if plane[0].size == 2:
@@ -384,16 +384,16 @@ def _type_of_line_acting_on_heisenberg_plus_line(
         if plane_moves_line:
             return ("A5,21", ())
         return (
-            _make_summand("A5,24", eps=1) if line_moves_centre else _make_summand("A5,23", b=ratio_or_zero(line, value))
+            _make_summand("A5,24", eps=1) if line_moves_centre else _make_summand("A5,23", b=snapped_ratio(line, value))
         )
     if plane_moves_line:
         if is_zero(line, scale):
             return ("A5,29", ())
-        return ("A5,27", ()) if line_moves_centre else _make_summand("A5,28", a=ratio_or_zero(trace, line))
+        return ("A5,27", ()) if line_moves_centre else _make_summand("A5,28", a=snapped_ratio(trace, line))
     values = [block.eigenvalue.real for block in plane]
     top = max(map(abs, values))
     candidates = [
-        (ratio_or_zero(trace, value), ratio_or_zero(line, value)) for value in values if abs(value) > top * (1.0 - 1e-9)
+        (snapped_ratio(trace, value), snapped_ratio(line, value)) for value in values if abs(value) > top * (1.0 - 1e-9)
     ]
     a, b = max(candidates)
     return _make_summand("A5,20", a=a) if line_moves_centre else _make_summand("A5,19", a=a, b=b)
@@ -418,7 +418,7 @@ def _type_of_line_acting_on_engel(work: WorkingConstants, nilradical, derived_id
     if not is_zero(outer_action, max(abs(outer_action), abs(inner_action))):
         if blocks[0].size == 2:
             return ("A5,31", ())
-        return _make_summand("A5,30", a=ratio_or_zero(inner_action, outer_action) + 1.0)
+        return _make_summand("A5,30", a=snapped_ratio(inner_action, outer_action) + 1.0)
     motion = _ad_matrix_on_quotient(work, x, rows, derived_ideal[:0]).astype(np.float64) / inner_action
     shift = _ad_matrix_on_quotient(work, complement(rows, nilradical, work.name)[0], rows, derived_ideal[:0]).astype(
         np.float64
@@ -439,7 +439,7 @@ GENERIC_ANGLES = (0.61, 1.93, 2.71, 1.17)
 """Angles of the combinations of two matrices that are tried until all decisions are clear."""
 
 
-def _first_clear_type(
+def _type_by_generic_combination(
     matrices: list[np.ndarray], recognise: Callable[[list[np.ndarray], np.ndarray], Summand]
 ) -> Summand:
     """Return the type that a function finds from two matrices and a generic combination of them."""
@@ -475,7 +475,7 @@ def _type_of_plane_acting_on_abelian(matrices: list[np.ndarray], generic: np.nda
             basis = weights[[i, j]]
             if abs(np.linalg.det(basis)) > 1e-7:
                 b, a = np.linalg.solve(basis.T, weights[k])
-                candidates.append((ratio_or_zero(a, 1.0), ratio_or_zero(b, 1.0)))
+                candidates.append((snapped_ratio(a, 1.0), snapped_ratio(b, 1.0)))
         a, b = min(candidates, key=lambda pair: (round(abs(pair[0]) + abs(pair[1]), 9), -pair[0], -pair[1]))
         return _make_summand("A5,33", a=a, b=b)
     pair = int(np.argmax(eigenvalues.imag))
@@ -486,7 +486,7 @@ def _type_of_plane_acting_on_abelian(matrices: list[np.ndarray], generic: np.nda
     if abs(np.linalg.det(real_and_imaginary)) < 1e-7:
         raise AmbiguousRoundingError("the dilation and the rotation of a plane are nearly dependent")
     b, a = np.linalg.solve(real_and_imaginary.T, line)
-    return _make_summand("A5,35", a=abs(ratio_or_zero(a, 1.0)), b=ratio_or_zero(b, 1.0))
+    return _make_summand("A5,35", a=abs(snapped_ratio(a, 1.0)), b=snapped_ratio(b, 1.0))
 
 
 def _type_of_shear_and_scaling(matrices: list[np.ndarray], generic: np.ndarray, blocks: list[JordanBlock]) -> Summand:
@@ -513,4 +513,4 @@ def _type_of_shear_and_scaling(matrices: list[np.ndarray], generic: np.ndarray, 
     if abs(np.linalg.det(conditions)) < 1e-7:
         raise AmbiguousRoundingError("the shear and the dilation of a plane are nearly dependent")
     a = line_weights @ np.linalg.solve(conditions, [0.0, 1.0])
-    return _make_summand("A5,34", a=ratio_or_zero(float(a), 1.0))
+    return _make_summand("A5,34", a=snapped_ratio(float(a), 1.0))

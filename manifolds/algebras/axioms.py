@@ -133,14 +133,15 @@ def scale_and_snap_to_fractions(
     The constants are those of the matrices of norm 1 in ``columns``.
     """
 
-    def max_residual(constants):
+    def max_commutator_residual(constants):
         return np.abs(columns @ constants.reshape(len(constants) ** 2, -1).T - commutators).max()
 
     scaled_constants = constants * scales
     rounded_constants = _nearest_fractions(scaled_constants, 1e-12 * np.maximum(scales, np.abs(scaled_constants)))
     return (
         rounded_constants
-        if max_residual(rounded_constants / scales) <= max(4 * np.finfo(float).eps, max_residual(constants))
+        if max_commutator_residual(rounded_constants / scales)
+        <= max(4 * np.finfo(float).eps, max_commutator_residual(constants))
         else scaled_constants
     )
 

@@ -190,7 +190,7 @@ class DirectSum(BracketAlgebra):
         return self._block_diagonal_matrix("the Cartan involution", lambda g: g.cartan_involution())
 
     def killing_inner_product(self) -> BlockDiagonal:
-        forms = tuple(_to_operator(g.killing_inner_product()) for g, _ in self.blocks)
+        forms = tuple(_to_jax_if_dense(g.killing_inner_product()) for g, _ in self.blocks)
         return BlockDiagonal(forms, tuple(g.dim for g, _ in self.blocks), tuple(count for _, count in self.blocks))
 
     def killing_signature(self) -> tuple[int, int, int]:
@@ -427,7 +427,7 @@ def _block_diagonal(stacks: list[jax.Array]) -> jax.Array:
     return matrix
 
 
-def _to_operator(form):
+def _to_jax_if_dense(form):
     return jnp.asarray(form) if isinstance(form, np.ndarray) else form
 
 

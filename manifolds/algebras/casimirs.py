@@ -449,10 +449,10 @@ def leading_casimirs(g: AlgebraStructure) -> list[tuple[str, Callable]]:
         for i, casimir in enumerate(polynomials):
             text = str(casimir)
             named_casimirs.append((text if len(text) <= 60 else f"Casimir {i + 1} of degree {degree}", casimir))
-    return named_casimirs + _independent_invariants(g, [F for _, F in named_casimirs], count)
+    return named_casimirs + _invariants_independent_of(g, [F for _, F in named_casimirs], count)
 
 
-def _independent_invariants(g: AlgebraStructure, polynomials: list, count: int) -> list[tuple[str, Callable]]:
+def _invariants_independent_of(g: AlgebraStructure, polynomials: list, count: int) -> list[tuple[str, Callable]]:
     """Return the invariants given with the algebra that are independent of the polynomials at a random point."""
     functions, named_invariants = list(polynomials), list[tuple[str, Callable]]()
     mu = np.random.default_rng(0).standard_normal(g.dim)

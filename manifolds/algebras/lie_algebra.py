@@ -33,7 +33,7 @@ from .casimirs import DEFAULT_MAX_DEGREE, casimirs, casimirs_up_to, check_invari
 from .killing import cartan_involution_of, killing_form_of, row_space_basis
 from .polynomial_casimirs import casimir_count
 from .structure import Action, AdMatrixAction, Operator, terms_to_unroll, unrolled_bracket
-from .structure_methods import CasimirInBasis, StructureMethods, constants_in_basis
+from .structure_methods import CasimirInBasis, StructureMethods, constants_and_inverse_in_basis
 
 
 @jax.tree_util.register_static
@@ -245,7 +245,7 @@ class LieAlgebra(StructureMethods):
         >>> print(g.bracket([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
         [0.  0.  0.5]
         """
-        constants, inverse = constants_in_basis(self, P)
+        constants, inverse = constants_and_inverse_in_basis(self, P)
         rows = tuple(map(tuple, inverse.astype(np.float64).tolist()))
         basis = None if self.basis is None else np.tensordot(np.asarray(P, dtype=np.float64), self.basis, axes=(1, 0))
         algebra = LieAlgebra(constants, name=name or self.name, basis=basis, basis_names=basis_names)
@@ -522,14 +522,14 @@ class LieAlgebra(StructureMethods):
         rounded_theta = np.asarray(np.round(theta))
         return _read_only_copy(rounded_theta if np.abs(rounded_theta - theta).max() < 1e-10 else theta)
 
-    def _ideal_series_dims(self, factors_of_ideal: Callable) -> list[int]:
+    def _ideal_series_dims(self, spans_to_bracket: Callable) -> list[int]:
         """Return the dimensions of a series of ideals until they no longer fall.
 
-        ``factors_of_ideal`` maps rows that span an ideal to the two spans whose brackets span the next one.
+        ``spans_to_bracket`` maps rows that span an ideal to the two spans whose brackets span the next one.
         """
         ideal, dims = np.eye(self.dim), [self.dim]
         while True:
-            left_factor, right_factor = factors_of_ideal(ideal)
+            left_factor, right_factor = spans_to_bracket(ideal)
             products = np.einsum(
                 "ia,jb,abc->ijc", left_factor, right_factor, self._balanced_constants_and_factors[0], optimize=True
             )

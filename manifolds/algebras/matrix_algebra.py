@@ -326,26 +326,26 @@ def _trace_of_power(n: int, hermitian: bool, M: MatrixParts) -> jax.Array:
 @_trace_of_power.defjvp
 def _trace_of_power_jvp(n: int, hermitian: bool, primals, tangents):
     (M,), (dM,) = primals, tangents
-    return _trace_of_power(n, hermitian, M), n * _trace_of_power_times(n - 1, hermitian, M, dM)
+    return _trace_of_power(n, hermitian, M), n * _trace_of_power_times_matrix(n - 1, hermitian, M, dM)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _trace_of_power_times(n: int, hermitian: bool, M: MatrixParts, D: MatrixParts) -> jax.Array:
+def _trace_of_power_times_matrix(n: int, hermitian: bool, M: MatrixParts, D: MatrixParts) -> jax.Array:
     """Return ``Re tr(M**n D)``."""
     return _real_trace_of_product(_matrix_power(M, n), D)
 
 
-@_trace_of_power_times.defjvp
-def _trace_of_power_times_jvp(n: int, hermitian: bool, primals, tangents):
+@_trace_of_power_times_matrix.defjvp
+def _trace_of_power_times_matrix_jvp(n: int, hermitian: bool, primals, tangents):
     """Return ``Re tr(M**n D)`` and its derivative along ``(dM, dD)``."""
     (M, D), (dM, dD) = primals, tangents
-    derivative = _trace_of_power_times(n, hermitian, M, dD)
+    derivative = _trace_of_power_times_matrix(n, hermitian, M, dD)
     for i in range(n if not hermitian else (n + 1) // 2):
         multiplicity = 2.0 if hermitian and 2 * i != n - 1 else 1.0
         derivative = derivative + multiplicity * _real_trace_of_product(
             _multiply_parts(_multiply_parts(_matrix_power(M, n - 1 - i), D), _matrix_power(M, i)), dM
         )
-    return _trace_of_power_times(n, hermitian, M, D), derivative
+    return _trace_of_power_times_matrix(n, hermitian, M, D), derivative
 
 
 def _matrix_power(M: MatrixParts, n: int) -> MatrixParts:

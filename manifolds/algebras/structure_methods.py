@@ -34,7 +34,7 @@ class StructureMethods(metaclass=ListedType):
         [[0. 0. 1.]]
         """
         work = substructure.working_constants(self)
-        return work.to_basis(substructure.centre(work))
+        return work.rows_in_algebra_basis(substructure.centre(work))
 
     def derived_ideals(self: AlgebraStructure) -> list[np.ndarray]:
         """Return g, [g, g], [[g, g], [g, g]], … as rows that span them, each of shape (k, dim).
@@ -43,7 +43,7 @@ class StructureMethods(metaclass=ListedType):
         :meth:`manifolds.LieAlgebra.derived_series`.
         """
         work = substructure.working_constants(self)
-        return [work.to_basis(ideal) for ideal in substructure.derived_ideals(work)]
+        return [work.rows_in_algebra_basis(ideal) for ideal in substructure.derived_ideals(work)]
 
     def lower_central_ideals(self: AlgebraStructure) -> list[np.ndarray]:
         """Return g, [g, g], [g, [g, g]], … as rows that span them, each of shape (k, dim).
@@ -52,7 +52,7 @@ class StructureMethods(metaclass=ListedType):
         :meth:`manifolds.LieAlgebra.lower_central_series`.
         """
         work = substructure.working_constants(self)
-        return [work.to_basis(ideal) for ideal in substructure.lower_central_ideals(work)]
+        return [work.rows_in_algebra_basis(ideal) for ideal in substructure.lower_central_ideals(work)]
 
     def derivations(self: AlgebraStructure) -> np.ndarray:
         """Return matrices D, shape (k, dim, dim), that span the derivations: ``D [x, y] = [D x, y] + [x, D y]``.
@@ -69,7 +69,7 @@ class StructureMethods(metaclass=ListedType):
     def radical(self: AlgebraStructure) -> np.ndarray:
         """Return the radical, the largest solvable ideal, as rows that span it, shape (k, dim)."""
         work = substructure.working_constants(self)
-        return work.to_basis(substructure.radical(work))
+        return work.rows_in_algebra_basis(substructure.radical(work))
 
     def nilradical(self: AlgebraStructure) -> np.ndarray:
         """Return the nilradical, the largest nilpotent ideal, as rows that span it, shape (k, dim).
@@ -80,7 +80,7 @@ class StructureMethods(metaclass=ListedType):
             If no element that separates the weights of the radical is found.
         """
         work = substructure.working_constants(self)
-        return work.to_basis(substructure.nilradical(work))
+        return work.rows_in_algebra_basis(substructure.nilradical(work))
 
     def levi_decomposition(self: AlgebraStructure) -> tuple[np.ndarray, np.ndarray]:
         """Return a Levi subalgebra and the radical as rows that span them; together they span the algebra.
@@ -100,7 +100,7 @@ class StructureMethods(metaclass=ListedType):
         """
         work = substructure.working_constants(self)
         levi, radical = substructure.levi_subalgebra(work)
-        return work.to_basis(levi), work.to_basis(radical)
+        return work.rows_in_algebra_basis(levi), work.rows_in_algebra_basis(radical)
 
     def index(self: AlgebraStructure) -> int:
         """Return the index: the least dimension of a stabilizer of the coadjoint action.
@@ -166,7 +166,7 @@ class CasimirInBasis:
         return f"{self.casimir} in another basis"
 
 
-def constants_in_basis(g: AlgebraStructure, rows) -> tuple[np.ndarray, np.ndarray]:
+def constants_and_inverse_in_basis(g: AlgebraStructure, rows) -> tuple[np.ndarray, np.ndarray]:
     """Return the structure constants in the basis ``sum_b rows[a, b] e_b``, and the inverse matrix of rows.
 
     Both are fractions (dtype object) if the structure constants and the rows are rational.

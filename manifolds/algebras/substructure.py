@@ -66,7 +66,7 @@ class WorkingConstants:
         """Return the matrices of ad of each row, shape (k, dim, dim)."""
         return np.tensordot(rows, self.constants, axes=(1, 0)).transpose(0, 2, 1)
 
-    def to_basis(self, rows: np.ndarray) -> np.ndarray:
+    def rows_in_algebra_basis(self, rows: np.ndarray) -> np.ndarray:
         """Return rows in the basis of the algebra as floats: coprime integers, or orthonormal rows."""
         if is_exact(rows):
             return integer_rows(rows).astype(np.float64).reshape(-1, self.dim)
@@ -94,7 +94,7 @@ def centre(work: WorkingConstants) -> np.ndarray:
 
 
 def derived_ideals(work: WorkingConstants, ideal: np.ndarray | None = None) -> list[np.ndarray]:
-    """Return rows of g, [g, g], [[g, g], [g, g]], … until the dimension no longer falls; or those of an ideal."""
+    """Return rows that span h, [h, h], [[h, h], [h, h]], … while the dimension falls; h is ``ideal``, by default g."""
     ideals = [work.full_space_rows if ideal is None else ideal]
     while len(ideals[-1]):
         next_ideal = work.span_of_brackets(ideals[-1], ideals[-1])
@@ -105,7 +105,7 @@ def derived_ideals(work: WorkingConstants, ideal: np.ndarray | None = None) -> l
 
 
 def lower_central_ideals(work: WorkingConstants, ideal: np.ndarray | None = None) -> list[np.ndarray]:
-    """Return rows of g, [g, g], [g, [g, g]], … until the dimension no longer falls; or those of an ideal."""
+    """Return rows that span h, [h, h], [h, [h, h]], … while the dimension falls; h is ``ideal``, by default g."""
     full_ideal = work.full_space_rows if ideal is None else ideal
     ideals = [full_ideal]
     while len(ideals[-1]):

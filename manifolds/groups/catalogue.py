@@ -189,7 +189,7 @@ SUBALGEBRA_TOLERANCE = 1e-10
 """Largest distance of a bracket of unit vectors from the subalgebra."""
 
 
-def subalgebra_basis(group: MatrixGroup, spanning_matrices) -> np.ndarray:
+def orthonormal_subalgebra_basis(group: MatrixGroup, spanning_matrices) -> np.ndarray:
     """Return orthonormal components of a basis of the subalgebra that matrices span, shape (k, dim of the group).
 
     Parameters

@@ -414,10 +414,10 @@ class MatrixGroup(metaclass=ListedType):
     def cayley_is_adjoint(self) -> bool:
         """Return True if :meth:`cayley` has ``Ad(cayley(x)) = cay(ad(x))``, as in SO(3) and SE(2)."""
         if self.cayley_map is None or self.cayley_map is self.adjoint_cayley_map or self in _catalogued_groups:
-            return self.cayley_map is self.adjoint_cayley_map and self._is_map_in_group("cayley")
-        return replace(self, adjoint_cayley_map=self.cayley_map)._is_map_in_group("adjoint_cayley")
+            return self.cayley_map is self.adjoint_cayley_map and self._has_map_into_group("cayley")
+        return replace(self, adjoint_cayley_map=self.cayley_map)._has_map_into_group("adjoint_cayley")
 
-    def _is_map_in_group(self, kind: str) -> bool:
+    def _has_map_into_group(self, kind: str) -> bool:
         """Return True if the group has the map, and the map stays in the group."""
         if getattr(self, f"{kind}_map") is None:
             return False
@@ -425,7 +425,7 @@ class MatrixGroup(metaclass=ListedType):
 
     def _require_map(self, kind: str) -> None:
         """Raise LieAlgebraError unless the group has the map, and the map stays in the group."""
-        if self._is_map_in_group(kind):
+        if self._has_map_into_group(kind):
             return
         map_text, remedy = _MAP_TEXTS[kind]
         residual = self.map_defect(kind)

@@ -86,8 +86,8 @@ def solve(a, b) -> jax.Array:
     return jax.lax.custom_linear_solve(
         lambda x: a @ x,
         b,
-        solve=lambda _, b: _eliminate(a, b)[0],
-        transpose_solve=lambda _, b: _eliminate(a.swapaxes(-1, -2), b)[0],
+        solve=lambda _, b: _solution_and_determinant(a, b)[0],
+        transpose_solve=lambda _, b: _solution_and_determinant(a.swapaxes(-1, -2), b)[0],
     )
 
 
@@ -179,7 +179,7 @@ def determinant(a) -> jax.Array:
     if a.shape[-1] <= 3:
         row, *other_rows = jnp.moveaxis(a, (-2, -1), (0, 1))
         return _determinant_by_minors(row, *other_rows)
-    det = _eliminate(a, a[..., :0])[1]
+    det = _solution_and_determinant(a, a[..., :0])[1]
     # a matrix of numbers leads to NaN only by way of a pivot of zero
     return jnp.where(jnp.isnan(det) & jnp.isfinite(a).all(axis=(-2, -1)), 0.0, det)
 
@@ -217,7 +217,7 @@ def _one_norm(matrix) -> jax.Array:
     return jnp.abs(matrix).sum(axis=-2).max(axis=-1)
 
 
-def _eliminate(a, b):
+def _solution_and_determinant(a, b):
     """Return the solution of ``a x = b`` and the determinant of a.
 
     In each step the pivot column leaves the table on the left and the pivot row enters at the bottom, so that the

@@ -324,7 +324,7 @@ def spectral_difference(f: Callable | ScalarFunction, a, b) -> jax.Array:
     return (gradient + adjoint(gradient)) / 2
 
 
-def log_mean(logs, shift, x) -> jax.Array:
+def apply_log_mean(logs, shift, x) -> jax.Array:
     """Return ``L X``, with the logarithmic mean of ``e^-s A`` from the left and ``e^s A`` from the right, ``A =
     exp(logs)``.
 

@@ -107,7 +107,7 @@ def _jacobi_rotation(axes, alpha, beta, entry):
     return np.eye(len(e)) + (cosine - 1.0) * plane_projector + sine * turn
 
 
-def orthogonal_images(a) -> tuple[jax.Array, jax.Array]:
+def one_sided_jacobi_svd(a) -> tuple[jax.Array, jax.Array]:
     """Return ``a V``, shape (..., m, n), with orthogonal columns, and the unitary V, shape (..., n, n): a Jacobi SVD.
 
     The norms of the columns are the singular values of a, in no order, each accurate to a rounding of the largest:
@@ -133,7 +133,7 @@ def polar(a) -> jax.Array:
 
     It is accurate to rounding over the sum of the two least singular values, and has derivatives of every order.
     """
-    images, vectors = orthogonal_images(a)
+    images, vectors = one_sided_jacobi_svd(a)
     norms = jnp.sqrt((jnp.abs(images) ** 2).sum(axis=-2, keepdims=True))
     has_full_rank = norms.min(axis=-1, keepdims=True) > _RANK_TOLERANCE * norms.max(axis=-1, keepdims=True)
     u = newton_schulz_step((images / jnp.where(has_full_rank, norms, 1.0)) @ adjoint(vectors))
@@ -153,7 +153,7 @@ def _polar_derivative(primals, tangents):
     tangential_rate = adjoint(u) @ da
     h = adjoint(u) @ a
     h = 0.5 * (h + adjoint(h))
-    images, vectors = orthogonal_images(jax.lax.stop_gradient(a))
+    images, vectors = one_sided_jacobi_svd(jax.lax.stop_gradient(a))
     singular_values = jnp.sqrt((jnp.abs(images) ** 2).sum(axis=-2))
     singular_value_sums = singular_values[..., :, None] + singular_values[..., None, :]
 

@@ -192,7 +192,7 @@ class EuclideanRetraction(Chart):
 
     _reach = forward_to("space", "_euclidean_reach")
 
-    def _midpoint_relative_length(self, z, v):
+    def _midpoint_reach(self, z, v):
         return 0.5 * self.space._euclidean_reach(z, v)
 
 
@@ -303,7 +303,7 @@ class CayleyRetraction(_GroupChart):
     def _reach(self, z, v):
         return 0.0 * self.space._reach(z, v)
 
-    def _midpoint_relative_length(self, z, v):
+    def _midpoint_reach(self, z, v):
         return math.pi / 4.0 * self.space._reach(z, v)
 
 
@@ -340,7 +340,7 @@ class MidpointRetraction(Retraction):
         z = self.chart._middle(x, y)
         return z, self.chart._vector(z, y) - self.chart._vector(z, x)
 
-    _reach = forward_to("chart", "_midpoint_relative_length")
+    _reach = forward_to("chart", "_midpoint_reach")
 
     def __repr__(self) -> str:
         return f"MidpointRetraction({self.chart!r})"

@@ -198,7 +198,7 @@ class Chart(Retraction):
         return jax.lax.fori_loop(0, _MIDPOINT_ITERATIONS, improve_midpoint, self._point(x, 0.5 * self._vector(x, y)))
 
     def _carry(self, z, v, u):
-        """Implement :meth:`carry`."""
+        """Return the vector u carried from z to ``point(z, v)``; SpaceError for a chart that cannot carry vectors."""
         raise SpaceError(
             f"{self} gives no _carry, so its base point cannot lie in the middle of a step. Use retraction='exp', "
             "which has it at the start"
@@ -206,7 +206,7 @@ class Chart(Retraction):
 
     _reach = forward_to("space")
 
-    def _midpoint_relative_length(self, z, v):
+    def _midpoint_reach(self, z, v):
         """Return the reach of the step v with z in its middle."""
         return self.space._reach(z, v)
 
@@ -270,8 +270,8 @@ class Coordinates(Module):
         """Return the tangent vector at z with components c: the inverse of :meth:`components`."""
 
     @abstractmethod
-    def at(self, c) -> Place:
-        """Return the point with the coordinates c, with the maps of vectors and covectors there."""
+    def point_and_maps_at(self, c) -> Place:
+        """Return the point with the coordinates c, with the maps that lift covectors and lower vectors there."""
 
     @abstractmethod
     def centre(self) -> Place:
@@ -322,7 +322,7 @@ class _ChartCoordinates(Coordinates):
     def vector(self, c):
         return self.chart.space._from_coordinates(self.z, c)
 
-    def at(self, c):
+    def point_and_maps_at(self, c):
         space = self.chart.space
         axes = np.broadcast_to(np.eye(space.dim)[(slice(None), *(None,) * (c.ndim - 1))], (space.dim, *c.shape))
         x, push_forward = jax.linearize(self.point, c)
@@ -371,10 +371,10 @@ class _ProductCoordinates(Coordinates):
             )
         )
 
-    def at(self, c):
+    def point_and_maps_at(self, c):
         return self._join_places(
             [
-                factor.at(component)
+                factor.point_and_maps_at(component)
                 for factor, component in zip(self.factor_coordinates, self._split_components(c), strict=True)
             ]
         )
@@ -420,17 +420,18 @@ class _PowerCoordinates(Coordinates):
     def vector(self, c):
         return self.base.vector(self._split_components(c))
 
-    def at(self, c):
-        return self._join_places(self.base.at(self._split_components(c)))
+    def point_and_maps_at(self, c):
+        return self._join_copies(self.base.point_and_maps_at(self._split_components(c)))
 
     def centre(self):
-        return self._join_places(self.base.centre())
+        return self._join_copies(self.base.centre())
 
-    def _join_places(self, place: Place) -> Place:
+    def _join_copies(self, stacked_place: Place) -> Place:
+        """Return the place on the power from the places of its copies, stacked along an axis."""
         return Place(
-            place.point,
-            lambda alpha: place.lift(self._split_components(alpha)),
-            lambda v: self._join_components(place.lower(v)),
+            stacked_place.point,
+            lambda alpha: stacked_place.lift(self._split_components(alpha)),
+            lambda v: self._join_components(stacked_place.lower(v)),
         )
 
     def _split_components(self, c):

@@ -156,7 +156,7 @@ class GeomstatsSpace(Space):
 
     def _frame(self, x):
         """Return Gram-Schmidt vectors of the projections of ``dim`` axes, which are chosen for independence."""
-        axis_vectors = jnp.asarray(self._ambient_basis)[_independent_axes(self, x)]
+        axis_vectors = jnp.asarray(self._ambient_basis)[_tangent_basis_axes(self, x)]
         base = self._with_frame_axis(x)
         vectors = self._project_tangent(base, axis_vectors)
         left_vectors, right_vectors = jnp.expand_dims(vectors, -2 - len(self.shape)), self._with_frame_axis(vectors)
@@ -341,9 +341,7 @@ r"""Implementation of each kernel on arrays of shape (count, \*shape)."""
 # -- callbacks ----------------------------------------------------------------------------------------------------
 
 
-def _call_function_on_host(
-    space: GeomstatsSpace, function: Callable, check_indices_and_return_shapes: tuple[int, ...], dtype, arrays
-):
+def _call_function_on_host(space: GeomstatsSpace, function: Callable, result_shape: tuple[int, ...], dtype, arrays):
     """Call ``function`` on the host, on arrays with one batch axis, from a JAX program with any number of batch
     axes."""
     batch = arrays[0].shape[: arrays[0].ndim - len(space.shape)]
@@ -351,11 +349,11 @@ def _call_function_on_host(
     def run_on_host(*arrays):
         host_batch = arrays[0].shape[: arrays[0].ndim - len(space.shape)]
         result = function(*(np.asarray(a).reshape(-1, *space.shape) for a in arrays))
-        return result.reshape((*host_batch, *check_indices_and_return_shapes)).astype(dtype)
+        return result.reshape((*host_batch, *result_shape)).astype(dtype)
 
     return jax.pure_callback(
         run_on_host,
-        jax.ShapeDtypeStruct((*batch, *check_indices_and_return_shapes), dtype),
+        jax.ShapeDtypeStruct((*batch, *result_shape), dtype),
         *arrays,
         vmap_method="broadcast_all",
     )
@@ -412,10 +410,8 @@ def _log_jvp(space: GeomstatsSpace, primals, tangents):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _jacobian(space: GeomstatsSpace, kernel: str, arrays):
-    check_indices_and_return_shapes = (math.prod(space._result_shape(kernel)), len(arrays) * math.prod(space.shape))
-    return _call_function_on_host(
-        space, partial(space._jacobian_on_host, kernel), check_indices_and_return_shapes, np.float64, arrays
-    )
+    result_shape = (math.prod(space._result_shape(kernel)), len(arrays) * math.prod(space.shape))
+    return _call_function_on_host(space, partial(space._jacobian_on_host, kernel), result_shape, np.float64, arrays)
 
 
 @_jacobian.defjvp
@@ -424,19 +420,19 @@ def _refuse_second_derivative(space: GeomstatsSpace, kernel: str, primals, tange
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _independent_axes(space: GeomstatsSpace, x):
+def _tangent_basis_axes(space: GeomstatsSpace, x):
     """Return the axes, shape (dim,), whose projections are the best basis of the tangent space at x: pivoted
     Gram-Schmidt."""
-    return _call_function_on_host(space, partial(_independent_axes_on_host, space), (space.dim,), np.int64, [x])
+    return _call_function_on_host(space, partial(_tangent_basis_axes_on_host, space), (space.dim,), np.int64, [x])
 
 
-@_independent_axes.defjvp
-def _independent_axes_jvp(space: GeomstatsSpace, primals, tangents):
-    indices = _independent_axes(space, *primals)
+@_tangent_basis_axes.defjvp
+def _tangent_basis_axes_jvp(space: GeomstatsSpace, primals, tangents):
+    indices = _tangent_basis_axes(space, *primals)
     return indices, np.zeros(indices.shape, jax.dtypes.float0)
 
 
-def _independent_axes_on_host(space: GeomstatsSpace, x: np.ndarray) -> np.ndarray:
+def _tangent_basis_axes_on_host(space: GeomstatsSpace, x: np.ndarray) -> np.ndarray:
     rows = []
     for point in x:
         axes = space._ambient_basis

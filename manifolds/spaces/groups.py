@@ -19,7 +19,7 @@ from ..groups.catalogue import SE, SL, SO, SU, Heisenberg
 from ..groups.closed_forms import affine_matrix, return_unchanged
 from ..groups.matrix_group import MEMBERSHIP_TOLERANCE, MatrixGroup, _log
 from ..matrices.linear import determinant, skew_matrix, solve, spectral_radius, symmetric_matrix
-from ..matrices.symmetric import orthogonal_images, orthonormal_columns, polar
+from ..matrices.symmetric import one_sided_jacobi_svd, orthonormal_columns, polar
 from .base import Space, register
 from .maps import inner_by_coordinates, inner_by_flat, squared_distance_with_cut_locus, tangential_part_by_projection
 
@@ -158,7 +158,7 @@ class GroupSpace(Space):
     # -- the metric of this space, which its subclasses replace -----------------------------------------------------
 
     def injectivity_radius(self, x=None):
-        """Return a lower bound of the radius: below it eigenvalues of the velocity are smaller than pi."""
+        """Return a lower bound of the injectivity radius: eigenvalues of a shorter velocity are smaller than pi."""
         basis = self._orthonormal_basis
         generic_element = np.einsum("a,aij->ij", np.random.default_rng(0).standard_normal(len(basis)), basis)
         if not np.abs(np.linalg.matrix_power(generic_element, len(generic_element))).max() > 1e-12 * np.abs(
@@ -288,7 +288,7 @@ class BiInvariantSpace(GroupSpace):
         to a rounding also where the cosine is small. NaN if the angles are not those of one logarithm in the algebra.
         """
         g, identity = self._relative_element(x, y), np.eye(self.shape[0])
-        cosines, vectors = orthogonal_images(g + identity)
+        cosines, vectors = one_sided_jacobi_svd(g + identity)
         sines = (g - identity) @ vectors
         angles = 2.0 * jnp.arctan2(*(jnp.sqrt((jnp.abs(a) ** 2).sum(axis=-2)) for a in (sines, cosines)))
         square = (angles**2).sum(axis=-1) / (jnp.abs(self.group.algebra._require_basis()[0]) ** 2).sum()

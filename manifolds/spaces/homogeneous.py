@@ -13,7 +13,7 @@ import numpy as np
 from .._arguments import checked_size
 from .._pytree_module import forward_to
 from ..errors import ParameterError, SpaceError
-from ..groups.catalogue import horizontal_factor_coordinates, subalgebra_basis
+from ..groups.catalogue import horizontal_factor_coordinates, orthonormal_subalgebra_basis
 from ..groups.matrix_group import MatrixGroup
 from ..matrices.exponential import expm
 from .base import CUT_MARGIN, Space, register
@@ -59,7 +59,7 @@ class Homogeneous(Space):
 
     def __init__(self, group, stabilizer, name: str | None = None):
         group_space = _group_space_of(group)
-        rows = subalgebra_basis(group_space.group, stabilizer)
+        rows = orthonormal_subalgebra_basis(group_space.group, stabilizer)
         horizontal_rows = (
             np.linalg.svd(rows, full_matrices=True)[2][len(rows) :] if len(rows) else np.eye(group_space.dim)
         )

@@ -275,8 +275,8 @@ class _ConstantMetric:
         return jnp.asarray(self.rows)
 
 
-def _torus(x):
+def _torus_function(x):
     return (jnp.sqrt(x[0] ** 2 + x[1] ** 2) - 2.0) ** 2 + x[2] ** 2 - 1.0
 
 
-register((_torus, 3))(LevelSet)
+register((_torus_function, 3))(LevelSet)

@@ -412,7 +412,7 @@ def squared_distance_with_cut_locus(space: Any, x, y):
 
 
 @squared_distance_with_cut_locus.defjvp
-def _extended_squared_distance_jvp(space, primals, tangents):
+def _squared_distance_with_cut_locus_jvp(space, primals, tangents):
     return squared_distance_with_cut_locus(space, *primals), jax.jvp(
         partial(SpaceMaps._squared_distance, space), primals, tangents
     )[1]

@@ -160,11 +160,11 @@ class Product(Space):
         return self._apply_to_constraint_parts("_correction", x, constraint_change)
 
     def _apply_to_constraint_parts(self, method_name: str, x, constraint_change):
-        """Call a method of every factor on its point and its constraints; join the results."""
+        """Call a method of every factor on its point and its part of ``constraint_change``; join the results."""
         points = self.split(x)
         sizes = [
-            constraint_change.shape[-1]
-            for constraint_change in jax.eval_shape(lambda x: self._apply_to_factors("_constraints", x), x)
+            constraints.shape[-1]
+            for constraints in jax.eval_shape(lambda x: self._apply_to_factors("_constraints", x), x)
         ]
         triples = zip(self.factors, points, jnp.split(constraint_change, np.cumsum(sizes)[:-1], axis=-1), strict=True)
         return self.join(*(getattr(factor, method_name)(point, component) for factor, point, component in triples))
@@ -487,7 +487,7 @@ class TangentBundle(Space):
         base = self.base
         return base.to_vector(base._tangential_part(base.from_vector(q), base.from_vector(w)))
 
-    def tangent_matrices(self, x) -> tuple[jax.Array, jax.Array]:
+    def tangent_projector_and_compensation(self, x) -> tuple[jax.Array, jax.Array]:
         """Return matrices P and N, shape (n, n), for which ``(P a, P b + N P a)`` are tangent vectors at flat (q, v).
 
         P is the projector along Q. Moving q takes v out of the tangent space: ``N q'`` is the component of v' across Q

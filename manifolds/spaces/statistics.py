@@ -97,7 +97,7 @@ def _traced_mean(space: Space, x: jax.Array, w: jax.Array) -> jax.Array:
         n_stalled = jnp.where(step_length < 0.5 * min_step_length, 0, n_stalled + 1)
         return space.exp(mean, step), step_length, jnp.minimum(min_step_length, step_length), n_stalled, count + 1
 
-    def is_at_rest(state):
+    def has_converged(state):
         mean, step_length, _, n_stalled, _ = state
         return (step_length == 0.0) | (
             (n_stalled > 2) & (step_length < 1e-12 * jnp.maximum(1.0, jnp.max(jnp.abs(mean))))
@@ -106,8 +106,8 @@ def _traced_mean(space: Space, x: jax.Array, w: jax.Array) -> jax.Array:
     first_mean = space.project(jnp.tensordot(weights, points, axes=1))
     first_mean = jnp.where(jnp.isfinite(first_mean).all(), first_mean, points[0])
     start = first_mean, jnp.inf * jnp.ones(()), jnp.inf * jnp.ones(()), jnp.zeros((), int), jnp.zeros((), int)
-    end = jax.lax.while_loop(lambda state: ~is_at_rest(state) & (state[-1] < MAX_ITERATIONS), karcher_step, start)
-    mean = jnp.where(is_at_rest(end), end[0], jnp.nan)
+    end = jax.lax.while_loop(lambda state: ~has_converged(state) & (state[-1] < MAX_ITERATIONS), karcher_step, start)
+    mean = jnp.where(has_converged(end), end[0], jnp.nan)
 
     def mean_log_coordinates(c, x, w):
         nearby_point = space.exp(mean, space.from_coordinates(mean, c))

@@ -429,7 +429,7 @@ class Grassmann(Space):
 
 
 def _angle_over_sine(half_angle_sine_squared):
-    """Return ``t / sin(t)`` for ``square = sin(t/2)^2``, by a series where that is small; NaN at a right angle."""
+    """Return ``t / sin(t)``, given ``sin(t/2)^2``, by a series where that is small; NaN at a right angle."""
     use_series = half_angle_sine_squared < _MAX_SERIES_SINE_SQUARED
     series = jnp.polyval(jnp.asarray(_ANGLE_OVER_SINE_SERIES), jnp.where(use_series, half_angle_sine_squared, 0.0))
     sine_squared = jnp.where(

@@ -180,7 +180,7 @@ class Bundle(Protocol):
 
     def tangential_part(self, q, w) -> jax.Array: ...
 
-    def tangent_matrices(self, x) -> tuple[jax.Array, jax.Array]: ...
+    def tangent_projector_and_compensation(self, x) -> tuple[jax.Array, jax.Array]: ...
 
 
 class TangentMap(NamedTuple):
@@ -283,7 +283,9 @@ class SplitContact(ContactStructure):
     def tangent_map(self, x) -> TangentMap | None:
         """Return the map of arrays to tangent vectors at x; None without a manifold."""
         return (
-            None if self.bundle is None else TangentMap(*self.bundle.tangent_matrices(x[: 2 * self.degrees_of_freedom]))
+            None
+            if self.bundle is None
+            else TangentMap(*self.bundle.tangent_projector_and_compensation(x[: 2 * self.degrees_of_freedom]))
         )
 
 

@@ -365,7 +365,7 @@ class DensityMatrices(PoissonBySharp):
 
     def matrix(self, x) -> jax.Array:
         """Return the Hermitian matrices with coordinates x, shape (..., N^2) to (..., N, N)."""
-        (re, im), (factor, sign), _ = _coordinate_indices(self.size)
+        (re, im), (factor, sign), _ = _entry_coordinates_and_factors(self.size)
         real, imaginary = (
             entries.reshape(*entries.shape[:-1], self.size, self.size) for entries in (x[..., re], x[..., im])
         )
@@ -376,7 +376,7 @@ class DensityMatrices(PoissonBySharp):
         """Return the coordinates of the Hermitian parts of matrices a, shape (..., N, N): the inverse of
         :meth:`matrix`."""
         xp = np if isinstance(a, np.ndarray) else jnp
-        transpose, (_, (factor, _), indices) = a.swapaxes(-1, -2), _coordinate_indices(self.size)
+        transpose, (_, (factor, _), indices) = a.swapaxes(-1, -2), _entry_coordinates_and_factors(self.size)
         entries = xp.stack(
             [(a.real + transpose.real) * (0.5 / factor), (a.imag - transpose.imag) * (0.5 / factor)], axis=-3
         )
@@ -396,7 +396,7 @@ class DensityMatrices(PoissonBySharp):
 
 
 @functools.lru_cache(maxsize=64)
-def _coordinate_indices(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _entry_coordinates_and_factors(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the index arrays, with factors, that convert between coordinates and matrix entries.
 
     The first array has the coordinate of the real and the imaginary part of each entry, the second the factors of these

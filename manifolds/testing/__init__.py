@@ -4,8 +4,8 @@ Each ``check_*`` runs the checks of every registered object of that kind. It ret
 :class:`PropertyError` with the table of the residuals.
 """
 
-from .._arguments import public_dir
+from .._arguments import module_dir_function
 from .suites import PropertyError, Report, Suite, check_algebra, check_group, check_space
 
 __all__ = ["PropertyError", "Report", "Suite", "check_algebra", "check_group", "check_space"]
-__dir__ = public_dir(__all__)
+__dir__ = module_dir_function(__all__)

@@ -1,6 +1,6 @@
 """Energies of spins, lattices, and the quantities that are measured in magnets."""
 
-from manifolds._arguments import public_dir
+from manifolds._arguments import module_dir_function
 
 from .bond_terms import biquadratic, exchange_tensor
 from .correlations import StructureFactor, dynamic_structure_factor, structure_factor, topological_charge
@@ -74,4 +74,4 @@ __all__ = [
     "write_ovf",
     "zeeman",
 ]
-__dir__ = public_dir(__all__)
+__dir__ = module_dir_function(__all__)
