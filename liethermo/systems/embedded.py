@@ -305,7 +305,7 @@ class ChartSystem(System):
     def cache_tensors_at(self, x) -> System:
         if self.place is not None:
             return self
-        return ChartSystem(self.manifold_system, self.coordinates, self.coordinates.point_and_maps_at(x), self.start)
+        return ChartSystem(self.manifold_system, self.coordinates, self.coordinates.at(x), self.start)
 
     def field(self, x, dH, dS, dL=()):
         point = _ChartPoint(self.manifold_system, self.coordinates, self.place, x)
@@ -318,7 +318,7 @@ class _ChartPoint:
 
     def __init__(self, system: System, coordinates: mf.Coordinates, place: mf.Place | None, c):
         assert system.space is not None
-        self._space, self._place = system.space, coordinates.point_and_maps_at(c) if place is None else place
+        self._space, self._place = system.space, coordinates.at(c) if place is None else place
         self.state = self._space.to_vector(self._place.point)
 
     def lift_covector(self, alpha):

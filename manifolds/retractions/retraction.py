@@ -270,7 +270,7 @@ class Coordinates(Module):
         """Return the tangent vector at z with components c: the inverse of :meth:`components`."""
 
     @abstractmethod
-    def point_and_maps_at(self, c) -> Place:
+    def at(self, c) -> Place:
         """Return the point with the coordinates c, with the maps that lift covectors and lower vectors there."""
 
     @abstractmethod
@@ -322,7 +322,7 @@ class _ChartCoordinates(Coordinates):
     def vector(self, c):
         return self.chart.space._from_coordinates(self.z, c)
 
-    def point_and_maps_at(self, c):
+    def at(self, c):
         space = self.chart.space
         axes = np.broadcast_to(np.eye(space.dim)[(slice(None), *(None,) * (c.ndim - 1))], (space.dim, *c.shape))
         x, push_forward = jax.linearize(self.point, c)
@@ -371,10 +371,10 @@ class _ProductCoordinates(Coordinates):
             )
         )
 
-    def point_and_maps_at(self, c):
+    def at(self, c):
         return self._join_places(
             [
-                factor.point_and_maps_at(component)
+                factor.at(component)
                 for factor, component in zip(self.factor_coordinates, self._split_components(c), strict=True)
             ]
         )
@@ -420,8 +420,8 @@ class _PowerCoordinates(Coordinates):
     def vector(self, c):
         return self.base.vector(self._split_components(c))
 
-    def point_and_maps_at(self, c):
-        return self._join_copies(self.base.point_and_maps_at(self._split_components(c)))
+    def at(self, c):
+        return self._join_copies(self.base.at(self._split_components(c)))
 
     def centre(self):
         return self._join_copies(self.base.centre())

@@ -356,7 +356,7 @@ def divergence_by_volume(M: Space, field, x, step: float = 2e-3) -> float:
 
     @jax.jit
     def volume_and_weighted_components(c):
-        place = coordinates.point_and_maps_at(c)
+        place = coordinates.at(c)
         frame = M._frame(place.point)
         volume = 1.0 / jnp.abs(jnp.linalg.det(jax.vmap(place.lower)(frame)))
         return volume, volume * place.lower(field(place.point))

@@ -40,7 +40,7 @@ def test_vectors_and_covectors_in_coordinates(chart):
     def everything(z, c, w, alpha):
         coordinates = mf.coordinates_around(chart, z)
         point, velocity = jax.jvp(coordinates.point, (c,), (w,))
-        place, centre = coordinates.point_and_maps_at(c), coordinates.centre()
+        place, centre = coordinates.at(c), coordinates.centre()
         pairings = space._pair(place.lift(alpha), velocity), space._pair(centre.lift(alpha), coordinates.vector(w))
         return (
             point,
@@ -48,7 +48,7 @@ def test_vectors_and_covectors_in_coordinates(chart):
             place.lower(velocity),
             pairings,
             centre.lower(coordinates.vector(w)),
-            coordinates.point_and_maps_at(0 * c)[0],
+            coordinates.at(0 * c)[0],
         )
 
     point, place_point, lowered_velocity, pairings, lowered_at_centre, centre = everything(z, c, w, alpha)
