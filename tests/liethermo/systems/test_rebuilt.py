@@ -23,7 +23,7 @@ REQUIRED_ARGUMENTS = {
     "toda_flow": {"n": 3},
 }
 
-NO_SYSTEMS = {"IdealMixture", "QuantisedSphere", "hermitian_matrix", "hermitian_state"}
+NAMES_WITHOUT_SYSTEM = {"IdealMixture", "QuantisedSphere", "hermitian_matrix", "hermitian_state"}
 """Public names of ``lt.models`` that are no systems and make none."""
 
 
@@ -31,7 +31,7 @@ def system_builders():
     yield from ((f"so(3), {case.name}", lambda case=case: build(mf.so(3), case)) for case in DISSIPATIONS)
     yield from SYSTEMS.items()
     yield from ((f"simple closed, {name}", lambda name=name: ISOLATED_SYSTEMS[name]) for name in ISOLATED_SYSTEMS)
-    for name in sorted({*lt.models.__all__} - NO_SYSTEMS):
+    for name in sorted({*lt.models.__all__} - NAMES_WITHOUT_SYSTEM):
         yield f"model {name}", functools.partial(getattr(lt.models, name), **REQUIRED_ARGUMENTS.get(name, {}))
 
 
