@@ -57,7 +57,7 @@ def write_atomically(path: Path, data: bytes | memoryview, mode: int = 0o666) ->
     """
     partial_file = path.with_name(partial_file_name(path.name))
     if path.exists() and not path.is_file():
-        raise OSError(errno.EEXIST, "what is there is not a plain file")
+        raise OSError(errno.EEXIST, "the path exists and is not a plain file")
     try:
         try:
             handle = os.open(partial_file, EXCLUSIVE_WRITE_FLAGS, mode)

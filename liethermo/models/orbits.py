@@ -128,7 +128,9 @@ class DipoleField(Module):
                 f"orbit must be a function of t, such as lt.torques.Orbit(...), got {type(orbit).__name__}"
             )
         if isinstance(orbit, Orbit) and orbit.radius is None:
-            raise InputError("the field depends on the radius of the orbit: lt.torques.Orbit(mean_motion, radius=...)")
+            raise InputError(
+                "the field depends on the radius of the orbit. Use lt.torques.Orbit(mean_motion, radius=...)"
+            )
         self.strength, self.orbit = checked_finite(strength, "strength", 3), orbit
         self.rotation = checked_finite(rotation, "rotation", 3)
 

@@ -29,16 +29,16 @@ def rigid_body(
     ``H = sum Pi_i^2 / (2 I_i)`` and the entropy ``S = |Pi|^2 / 2``. The second term is the torque. It is normal to
     Omega, so H is constant, and S grows: from almost every state it tends to ``max(I) * H``.
 
-    It is a model on so(3)*, of a body that is controlled from outside. A body left to itself, with friction between
-    its parts, keeps |Pi| and loses kinetic energy to heat: see :func:`tumbling_body`.
+    It is a model on so(3)*, of a body that is controlled from outside. A torque-free body, with friction between
+    its parts, conserves |Pi| and loses kinetic energy to heat: see :func:`tumbling_body`.
 
     Parameters
     ----------
     inertia : three positive numbers, or array of shape (3, 3)
         Principal moments of inertia, or the tensor in body axes (mass * length**2), or (0, J, J) for a slender rod,
         whose momentum has no component along its axis. The moments of a body obey ``I_i <= I_j + I_k``, since each is a
-        sum of two of three moments of its masses. The default is the paper's (Fig. 1), which does not: as equations on
-        so(3)* they are as good as any, but no rigid body has them.
+        sum of two of three moments of its masses. The default moments of the paper (Fig. 1) violate this
+        condition: the equations on so(3)* are valid, but no rigid body has such moments.
     rate : float, >= 0
         lambda in ``mu' = mu x Omega + lambda Omega x (mu x Omega)`` (time). 1 is the equation as printed in the paper,
         where 𝒦 is the dot product. It is ``KillingDissipation(rate / 2)``, since the Killing form of so(3) is -2 times

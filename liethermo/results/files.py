@@ -205,6 +205,11 @@ def load(path: str | os.PathLike) -> Solution | Ensemble:
     path : str or path
         The NetCDF file.
 
+    Returns
+    -------
+    Solution or Ensemble
+        The result that was saved.
+
     Raises
     ------
     FileError
@@ -213,7 +218,7 @@ def load(path: str | os.PathLike) -> Solution | Ensemble:
     Warns
     -----
     UserWarning
-        If an earlier version wrote the file, without a checksum: damage may show in nothing.
+        If an earlier version wrote the file, without a checksum, so damage cannot be detected.
 
     Examples
     --------

@@ -43,6 +43,11 @@ def suggest_step(system: System, x0, rtol: float = 1e-8, method: OneStepMethod |
         The time (in the unit of the system), for an energy or a torque that depends on it. A torque that depends on
         the attitude is evaluated at the identity.
 
+    Returns
+    -------
+    float
+        The step size (in the unit of time of the system).
+
     Raises
     ------
     InputError
@@ -122,6 +127,11 @@ def suggest_method(system: System, x0, rtol: float = 1e-8, t0: float = 0.0) -> M
     ----------
     system, x0, rtol, t0
         As for :func:`suggest_step`, with the same units.
+
+    Returns
+    -------
+    MethodSuggestion
+        The method, its step, the reason for the choice and the trials of all methods; it prints as a table.
 
     Raises
     ------

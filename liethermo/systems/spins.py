@@ -214,17 +214,10 @@ class SpinSystem(TorqueSystem):
         x : array, shape (n,) or ``(*sites, 3)``
         angle : float > 0
             In radian. Steps with noise have a bias of about a per cent with 0.3 [:doc:`/explanation/fluctuations`].
-        boltzmann : float >= 0
-            k, as of ``lt.Fluctuations``, for steps with noise; the temperatures are those of the baths.
+        boltzmann, temperature : float >= 0, and float > 0
+            k and T, as of ``lt.Fluctuations``, for steps with noise; T only for a system without baths.
         t : float
-            The time, for an energy, a torque or a temperature that depends on it.
-        temperature : float > 0, optional
-            The temperature of the noise of a system without baths, as of ``lt.Fluctuations``.
-
-        Raises
-        ------
-        InputError
-            If no spin turns, an argument is out of its range, or the temperature of the noise is missing.
+            The time. InputError if no spin turns, an argument is out of its range, or the temperature is missing.
         """
         positive_condition("the angle").require(checked_numbers(angle, "the angle", ()))
         nonnegative_condition("boltzmann").require(checked_numbers(boltzmann, "boltzmann", ()))
