@@ -14,7 +14,7 @@ from manifolds._arrays import real_array
 from manifolds._pytree_module import Module
 
 from ..functions.energy import Energy
-from ..tracing.programs import jit_subprogram
+from ..tracing.programs import jit_if_traced
 
 
 class HeatingSites:
@@ -119,7 +119,7 @@ class Geometry(Module):
         return self.space.to_vector(self.space._metric_covector(self.points(x), self.points(v)).conj())
 
 
-@jit_subprogram
+@jit_if_traced
 def _sharp(space: mf.Space, x, alpha) -> jax.Array:
     """Return the tangent vector of a covector at a point of a space, by its metric."""
     return space._sharp(x, alpha)

@@ -23,7 +23,7 @@ from manifolds._precision import with_library_settings
 from manifolds._pytree_module import Module, forward_to
 
 from ..errors import FunctionError, InputError
-from ..tracing.programs import jit_subprogram
+from ..tracing.programs import jit_if_traced
 from ..tracing.short_form import callable_name, short_form
 from .conditions import checked_numbers
 from .indices import (
@@ -50,7 +50,7 @@ from .time_span import (
 )
 
 
-@jit_subprogram
+@jit_if_traced
 def _autodiff_gradient(energy: Energy, x) -> jax.Array:
     """Return the gradient of an energy at a state, computed by JAX."""
     return jax.grad(energy.value)(x)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from ..tracing.searches import has_matrix_products
+from ..tracing.searches import has_large_matrix_products
 
 EXACT_PRIMITIVES = frozenset(
     """abs broadcast_in_dim ceil clamp concatenate convert_element_type copy copy_p copysign dynamic_slice
@@ -164,7 +164,7 @@ def _evaluate_perturbed(jaxpr: Jaxpr, constants, arguments, perturbation: Pertur
 
 def _is_routine_call(equation) -> bool:
     """Return whether an equation calls a function with products of matrices, which is a routine in machine code."""
-    return equation.primitive.name in ("jit", "pjit") and has_matrix_products(equation.params["jaxpr"].jaxpr)
+    return equation.primitive.name in ("jit", "pjit") and has_large_matrix_products(equation.params["jaxpr"].jaxpr)
 
 
 def _is_iteration(equation) -> bool:

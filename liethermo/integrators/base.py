@@ -373,7 +373,7 @@ SLOPE_ROUNDING_FACTOR = 30.0
 """Rounding errors, in units of the rounding of the field, by which solved slopes may differ from the field."""
 
 
-def generator_residual_jvp(system: System, slopes_to_stage_states: Callable, k) -> Callable:
+def generator_field_residual_jvp(system: System, slopes_to_stage_states: Callable, k) -> Callable:
     """Return the derivative of ``f(stage states) - k`` by k, where f is the generator field, which needs no entropy.
 
     It serves as :meth:`OneStepMethod.residual_jvp`: the slopes of a method differ from f only by the corrections of
@@ -385,12 +385,12 @@ def generator_residual_jvp(system: System, slopes_to_stage_states: Callable, k) 
 
 
 def collocation_error_estimate(system: System, x, compensation, h, k) -> jax.Array:
-    """Estimate the local error, O(h^{2s+1}), of collocation at s Gauss nodes from the residual of its polynomial u.
+    """Return an estimate, shape (), of the local error of collocation at s Gauss nodes, which is O(h^{2s+1}).
 
-    The residual ``f(x) - u'(0)`` at the start is O(h^s) relative to the speed [Hairer & Wanner 1996, IV.8]. The method
-    has order 2s, so the local error is estimated as the length of the step, h|k|, times the square of the relative
-    residual, divided by 2s + 1. This divisor makes the estimate right, to a factor that tends to 1, for a linear
-    oscillation of any amplitude.
+    The residual ``f(x) - u'(0)`` of the collocation polynomial u at the start is O(h^s) relative to the speed [Hairer &
+    Wanner 1996, IV.8]. The method has order 2s, so the local error is estimated as the length of the step, h|k|, times
+    the square of the relative residual, divided by 2s + 1. This divisor makes the estimate right, to a factor that
+    tends to 1, for a linear oscillation of any amplitude.
 
     The part of the residual that rounding may explain is subtracted: it does not shrink with h, and near a rest at the
     origin nothing else is left.

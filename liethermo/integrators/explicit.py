@@ -28,7 +28,7 @@ from .levels import (
     Law,
     correction_directions,
     correction_displacement,
-    level_correction,
+    level_correction_vector,
     project_onto_levels,
 )
 from .preserved import check_preserved, function_on_states, preserved_functions
@@ -275,7 +275,7 @@ class ExplicitMethod(TransportingMethod):
     def _drift_correction_changes(
         self, system: System, laws: list[Law], gradients: list, x, compensation, levels, follow_leaf: bool
     ) -> jax.Array:
-        """Return the changes of the conserved functions, shape (laws,), back to the levels at the start of the run.
+        """Return the changes of the functions, shape (laws,), that lead back to the levels at the start of the run.
 
         Each step is exact except for a few roundings, whose sum would be a random walk. The engines correct the energy
         in the same way. A function whose gradient depends on the previous ones, such as the entropy at an equilibrium,
@@ -312,7 +312,7 @@ class ExplicitMethod(TransportingMethod):
 
         def changes_by_level_correction() -> jax.Array:  # the drifts, as far as the level correction can cancel them
             directions = correction_directions(system, x, gradients, follow_leaf, momentum_dim)
-            correction = level_correction(system, directions, drifts, gives_small_displacement)
+            correction = level_correction_vector(system, directions, drifts, gives_small_displacement)
             return jnp.stack([jnp.dot(v, correction) for v in directions])
 
         return jax.lax.stop_gradient(jax.lax.cond((drifts != 0.0).any(), changes_by_level_correction, lambda: drifts))
@@ -320,7 +320,9 @@ class ExplicitMethod(TransportingMethod):
     def _project_conserved_first(
         self, laws: list[Law], x, compensation, project: Callable
     ) -> tuple[jax.Array, jax.Array]:
-        """Project a step onto the levels of conserved laws, or onto all levels if a monotone function then goes wrong.
+        """Return a projected displacement and its residual: onto the levels of the conserved laws if that is enough.
+
+        If a monotone function then changes with the wrong sign, the step is projected onto all levels.
 
         A function that rises or falls does so by the motion itself. A step with the wrong sign is therefore off the
         motion by at least the size of the second projection.

@@ -92,14 +92,17 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         z, dH, dS, dL = self.method.midpoint_and_gradients(system, x, compensation, h, k)
         factors_and_inputs = self._factors_and_drift_plus_noise(system, z, dH, dL, h)
-        turns = [
+        noise_rates_by_term = [
             B.spin_coefficients[..., None] * w.reshape(-1, 3)
             for B, w in factors_and_inputs
             if B.spin_coefficients is not None
         ]
-        if turns:
-            others = sum((B.times(w) for B, w in factors_and_inputs if B.spin_coefficients is None), jnp.zeros_like(z))
-            slopes = system.solve_slopes_at_each_spin(z, dH, dS, sum(turns[1:], turns[0]), others, 0.5 * h, k[0])
+        if noise_rates_by_term:
+            other_noise_velocity = sum(
+                (B.times(w) for B, w in factors_and_inputs if B.spin_coefficients is None), jnp.zeros_like(z)
+            )
+            noise_rates = sum(noise_rates_by_term[1:], noise_rates_by_term[0])
+            slopes = system.solve_slopes_at_each_spin(z, dH, dS, noise_rates, other_noise_velocity, 0.5 * h, k[0])
             if slopes is not None:
                 return slopes[None]
         return sum((B.times(w) for B, w in factors_and_inputs), system.field(z, dH, dS, dL))[None]
@@ -233,6 +236,7 @@ def with_noise_increments(method: OneStepMethod, dW) -> OneStepMethod:
 
 
 def _is_stochastic(node) -> bool:
+    """Return True if a node of a pytree is a StochasticMidpoint."""
     return isinstance(node, StochasticMidpoint)
 
 
@@ -249,6 +253,7 @@ def noise_invariance_by_name(system: System) -> dict[str, bool]:
 def _factor_residuals_and_noise_changes_at_samples(
     system: System,
 ) -> tuple[np.ndarray, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """Return :func:`_factor_residual_and_noise_changes` at four states of the system, along the first axis."""
     return evaluate_at_points(_factor_residual_and_noise_changes, system, system.samples(4))
 
 

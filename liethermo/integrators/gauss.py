@@ -32,11 +32,11 @@ from .base import (
     apply_increment,
     checked_stages,
     collocation_error_estimate,
-    generator_residual_jvp,
+    generator_field_residual_jvp,
     register,
 )
 from .charts import wrap_in_charts
-from .preserved import casimir_residuals, check_preserved, function_on_states, is_momentum_map, preserved_functions
+from .preserved import casimir_residuals, check_preserved, function_on_states, non_casimir_mask, preserved_functions
 from .tableaus import gauss_tableau, kronrod_rule
 
 CASIMIR_NEWTON_STEPS = 3
@@ -176,7 +176,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         method = self._with_transformed_functions(lambda C: function_on_states(system, C), also_conserved)
         if self.functions and not is_traced((system, method)):
             residuals = evaluate_at_points(casimir_residuals, (system, method.functions), system.samples(4))
-            momentum_maps = tuple(int(i) for i in np.flatnonzero(is_momentum_map(residuals)))
+            momentum_maps = tuple(int(i) for i in np.flatnonzero(non_casimir_mask(residuals)))
             method = method._with_transformed_functions(lambda C: C, also_conserved, momentum_maps)
         return wrap_in_charts(method, system, self.retraction, "exp")
 
@@ -274,6 +274,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         return u, dH, dS, gradients_by_name
 
     def _stage_states(self, x, compensation, h, k) -> jax.Array:
+        """Return the states at the stages of a step with the slopes k, shape (s, n)."""
         return x + (compensation + h * (gauss_tableau(self.number).A @ k))
 
     def _energy_gradients(self, system: System, u, x, compensation, h, k) -> jax.Array:
@@ -419,7 +420,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
     def residual_jvp(self, system: System, x, compensation, h, k) -> Callable:
         if not has_generator(system):
             return super().residual_jvp(system, x, compensation, h, k)
-        return generator_residual_jvp(system, lambda k: self._stage_states(x, compensation, h, k), k)
+        return generator_field_residual_jvp(system, lambda k: self._stage_states(x, compensation, h, k), k)
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
         return collocation_error_estimate(system, x, compensation, h, k)
@@ -441,9 +442,9 @@ ENTROPY_KEY = "the entropy"
 
 
 def _functions_determining_entropy(system: System) -> dict[str, Energy]:
-    """Return the functions, by name, of which the entropy is a function: all Casimirs if known, or itself.
+    """Return the functions, by name, of which the entropy is a function: all Casimirs if known, or the entropy.
 
-    A quadratic entropy is always returned itself.
+    For a quadratic entropy the result is this entropy. It is empty if the entropy is not used.
     """
     S = _entropy_if_used(system)
     if S is None:

@@ -37,8 +37,8 @@ _SUZUKI_FRACTIONS = {
 }
 
 SUBSTEPS: dict[int, tuple[tuple[float, bool], ...]] = {1: ((1.0, True),)} | {
-    order: tuple((0.5 * share, forward) for share in shares for forward in (True, False))
-    for order, shares in _SUZUKI_FRACTIONS.items()
+    order: tuple((0.5 * fraction, is_forward) for fraction in fractions for is_forward in (True, False))
+    for order, fractions in _SUZUKI_FRACTIONS.items()
 }
 """Substeps of a step, by order: (fraction of the step, True for the scheme or False for its adjoint)."""
 
@@ -82,7 +82,7 @@ class DiscreteHerglotz(OneStepMethod):
     why_fixed_step: ClassVar[str] = WHY_FIXED_VARIATIONAL_STEP
 
     discrete_lagrangian: Callable
-    composed: int = eqx.field(static=True)
+    number: int = eqx.field(static=True)
 
     def __init__(self, discrete_lagrangian: Callable, order: Literal[1, 2, 4] = 1):
         if order not in tuple(SUBSTEPS):
@@ -91,7 +91,7 @@ class DiscreteHerglotz(OneStepMethod):
             raise InputError(
                 f"the discrete Lagrangian must be a function of (q_0, q_1, S_0, h), got {discrete_lagrangian!r}"
             )
-        self.discrete_lagrangian, self.composed = discrete_lagrangian, order
+        self.discrete_lagrangian, self.number = discrete_lagrangian, order
 
     @classmethod
     def midpoint(cls, lagrangian, order: Literal[1, 2, 4] = 1) -> DiscreteHerglotz:
@@ -116,16 +116,16 @@ class DiscreteHerglotz(OneStepMethod):
 
     @property
     def stages(self) -> int:
-        return len(SUBSTEPS[self.composed])
+        return len(SUBSTEPS[self.number])
 
     @property
     def order(self) -> int:
-        return self.composed
+        return self.number
 
     preserves = frozenset()
 
     def __str__(self) -> str:
-        return "DiscreteHerglotz" if self.composed == 1 else f"DiscreteHerglotz(order={self.composed})"
+        return "DiscreteHerglotz" if self.number == 1 else f"DiscreteHerglotz(order={self.number})"
 
     def state(self, q0, q1, S0, h) -> jax.Array:
         """Return the state (q_1, p_1, S_1) after a known first step, shape (2n + 1,), from which a run can start."""
@@ -161,13 +161,14 @@ class DiscreteHerglotz(OneStepMethod):
 
     @property
     def _substep_fractions(self) -> np.ndarray:
-        return np.array([share for share, _ in SUBSTEPS[self.composed]])
+        """Sizes of the substeps over that of the step, shape (stages,)."""
+        return np.array([fraction for fraction, _ in SUBSTEPS[self.number]])
 
     def slopes(self, system: System, x, compensation, h, k) -> jax.Array:
         system = _evolution_system(system)
         space, y, slopes, n = system.configurations, x + compensation, [], len(x) // 2
         action = self.discrete_lagrangian if space is None else _ActionOfFlatArrays(self.discrete_lagrangian, space)
-        for (fraction, is_forward), guess in zip(SUBSTEPS[self.composed], k, strict=True):
+        for (fraction, is_forward), guess in zip(SUBSTEPS[self.number], k, strict=True):
             slope = (_forward_substep_slope if is_forward else _adjoint_substep_slope)(
                 action, system.contact, y, fraction * h, guess[:n]
             )
@@ -215,7 +216,10 @@ def _adjoint_substep_slope(action: Callable, contact: mf.SplitContact, y, h, gue
 
 
 def _newton_velocity(residual: Callable, contact: mf.SplitContact, q, h, velocity_guess) -> jax.Array:
-    """Return the velocity after one Newton step for ``residual(q + h velocity) = 0``, on a manifold along it."""
+    """Return the velocity after one Newton step for ``residual(q + h velocity) = 0``.
+
+    On a manifold the equation is solved along it, and ``q + h velocity`` is brought onto it.
+    """
     A, residual_value = h * jax.jacfwd(residual)(q + h * velocity_guess), residual(q + h * velocity_guess)
     if isinstance(contact.bundle, mf.TangentBundle):
         surface, mass = ConstraintSurface(contact.bundle.base, tangent=True), jnp.max(jnp.abs(A))

@@ -109,7 +109,7 @@ class KrausMethod(OneStepMethod):
         if (clock := system.clock) is not None:
             clock_time = clock.time(x)
         channel = _StepChannel.build(system, body.structure, clock_time, h, self.number)
-        middle, end = channel.apply(x[:n])
+        middle, end = channel.middle_and_end_states(x[:n])
         d = end - x[:n]
         if clock is not None:
             d = jnp.concatenate([d, _clock_and_work_increments(system, clock.unit, x, h, middle, end)])
@@ -178,16 +178,18 @@ class _StepChannel(NamedTuple):
         propagators = dict(zip(intervals, expm(jnp.stack(exponents)), strict=True))
         return cls(structure, order, h, operators, rates, propagators)
 
-    def apply(self, x) -> tuple[jax.Array, jax.Array]:
-        """Apply the channel to a state x; return the states in the middle and at the end of the step, shape (N^2,)."""
+    def middle_and_end_states(self, x) -> tuple[jax.Array, jax.Array]:
+        """Return the states, shape (N^2,) each, in the middle and at the end of the step that starts at x."""
         identity = self.structure.matrix(
-            jax.grad(lambda y: jnp.trace(self._unnormalised_map(self.structure.matrix(y))[1]).real)(jnp.zeros_like(x))
+            jax.grad(lambda y: jnp.trace(self._unnormalised_middle_and_end(self.structure.matrix(y))[1]).real)(
+                jnp.zeros_like(x)
+            )
         )
         root = mf.spectral(_inverse_square_root, identity)
-        middle, end = self._unnormalised_map(root @ self.structure.matrix(x) @ root)
+        middle, end = self._unnormalised_middle_and_end(root @ self.structure.matrix(x) @ root)
         return self.structure.vector(middle), self.structure.vector(end)
 
-    def _unnormalised_map(self, rho) -> tuple[jax.Array, jax.Array]:
+    def _unnormalised_middle_and_end(self, rho) -> tuple[jax.Array, jax.Array]:
         """Return rho in the middle and at the end of a step, by quadrature, before the trace is normalised."""
         start_gain = self._jump_gain(0.0, rho)
 
@@ -229,16 +231,15 @@ def _conjugate(W, rho) -> jax.Array:
     return W @ rho @ adjoint(W)
 
 
-def _inverse_square_root(p):
-    return 1.0 / jnp.sqrt(p)
+def _inverse_square_root(eigenvalues):
+    return 1.0 / jnp.sqrt(eigenvalues)
 
 
 def _magnus_exponents(J0, J, J1, h, intervals) -> list[jax.Array]:
     """Return the exponents of Magnus' expansion of order 4 on intervals of a step, shape (N, N) each.
 
-    J0, J and J1 are the generator ``-i H - ...`` of the propagator W at the start, the middle and the end of the step.
-
-    Over a step ``-i H - ...`` is replaced by a quadratic polynomial in time [Blanes et al. 2009].
+    J0, J and J1 are the generator of the propagator, ``W' = J W``, at the start, the middle and the end of the step.
+    Over a step the generator is replaced by a quadratic polynomial in time [Blanes et al. 2009].
     """
     slope, curvature = J1 - J0, 2.0 * (J0 - 2.0 * J + J1)
     commutator = slope @ J - J @ slope

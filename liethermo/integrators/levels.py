@@ -133,15 +133,15 @@ def project_onto_levels(
         d = s.d + correction_displacement(system, x + (compensation + s.d), s.correction, follow_leaf, momentum_dim)
         return (d, jnp.zeros(())) if surface is None else surface.project_displacement(x, compensation, d)
 
-    def change_vectors_at(state, gradients) -> list[jax.Array]:
-        """Return the vectors whose inner products with a displacement are the changes of the functions."""
+    def gradient_vectors_at(state, gradients) -> list[jax.Array]:
+        """Return the gradients as vectors: their inner products with a displacement are changes of the functions."""
         if follow_leaf:
             return [system.raise_index(state, v) for v in gradients]
         return correction_directions(system, state, gradients)
 
-    def max_possible_changes(change_vectors, d) -> jax.Array:
+    def max_possible_changes(gradient_vectors, d) -> jax.Array:
         """Return the largest change of each function in any displacement whose blocks are as long as those of d."""
-        return jnp.stack([sum(jnp.linalg.norm(v[b]) * jnp.linalg.norm(d[b]) for b in blocks) for v in change_vectors])
+        return jnp.stack([sum(jnp.linalg.norm(v[b]) * jnp.linalg.norm(d[b]) for b in blocks) for v in gradient_vectors])
 
     def change_gradient(f: Energy, d, start_gradient, end_gradient) -> jax.Array:
         """Return the discrete gradient of f along d; for a polynomial by a quadrature with gradients at both ends."""
@@ -165,8 +165,8 @@ def project_onto_levels(
             d=d, surface_residual=surface_residual, level_residual=level_residuals(d, end_gradients)
         ), end_gradients
 
-    def drop_monotone_residuals(s: ProjectionState) -> ProjectionState:
-        """Drop the residual of functions that rise or fall, unless they change with the wrong sign."""
+    def drop_allowed_monotone_residuals(s: ProjectionState) -> ProjectionState:
+        """Return the state without the residuals of functions that rise or fall, if they do so with the right sign."""
         actual_changes, rounding = (
             target_changes - s.level_residual,
             DIFFERENCE_NOISE * s.direction_lengths * jnp.linalg.norm(s.d),
@@ -178,7 +178,7 @@ def project_onto_levels(
         )
 
     def with_next_correction(s: ProjectionState, end_gradients, direction_mask=None) -> ProjectionState:
-        """Compute the next correction, along the directions in ``direction_mask``, and the lengths of all directions.
+        """Return s with the next correction, along the directions in ``direction_mask``, and the lengths of all.
 
         These lengths turn a residual of a function into a length like that of d. If parts of a state have different
         units, as entropies beside a momentum, the largest change of the function per length of d counts, or the
@@ -188,13 +188,13 @@ def project_onto_levels(
         end_state = x + (compensation + s.d)
         directions = correction_directions(system, end_state, end_gradients, follow_leaf, momentum_dim)
         is_same = not follow_leaf and not momentum_dim
-        change_vectors = directions if is_same else change_vectors_at(end_state, end_gradients)
+        gradient_vectors = directions if is_same else gradient_vectors_at(end_state, end_gradients)
         if len(blocks) == 1:
-            lengths = jnp.stack([jnp.linalg.norm(v) for v in change_vectors])
+            lengths = jnp.stack([jnp.linalg.norm(v) for v in gradient_vectors])
         else:
             step_length = jnp.linalg.norm(s.d)
-            max_changes = max_possible_changes(change_vectors, s.d)
-            products = jnp.abs(jnp.stack(change_vectors) @ jnp.stack(change_vectors).T)
+            max_changes = max_possible_changes(gradient_vectors, s.d)
+            products = jnp.abs(jnp.stack(gradient_vectors) @ jnp.stack(gradient_vectors).T)
             squares = jnp.diagonal(products)
             rounding_ratios = products / jnp.where(
                 squares > MIN_SQUARED_NORM, squares, 1.0
@@ -203,15 +203,15 @@ def project_onto_levels(
         if direction_mask is not None:
             directions = [jnp.where(direction_mask[i], v, 0.0) for i, v in enumerate(directions)]
         if work_direction is None:
-            correction = level_correction(system, directions, s.level_residual)
+            correction = level_correction_vector(system, directions, s.level_residual)
         else:
             start_lengths = max_possible_changes(start_vectors, s.d) / jnp.maximum(
                 jnp.linalg.norm(s.d), VANISHED_LENGTH
             )
-            is_unreachable = is_level_unreachable(s, max_possible_changes(change_vectors, s.d))
+            is_unreachable = is_level_unreachable(s, max_possible_changes(gradient_vectors, s.d))
             lengths = jnp.maximum(lengths, MIN_MEAN_GRADIENT * start_lengths)
             work = s.level_residual * jnp.stack([jnp.dot(v, work_direction) for v in end_gradients])
-            correction = level_correction(system, directions, jnp.where(is_unreachable, 0.0, s.level_residual))
+            correction = level_correction_vector(system, directions, jnp.where(is_unreachable, 0.0, s.level_residual))
             correction += jnp.sum(jnp.where(is_unreachable, work, 0.0)) * work_direction
         return s._replace(direction_lengths=lengths, correction=correction)
 
@@ -230,7 +230,10 @@ def project_onto_levels(
         return (s.surface_residual == 0.0) & (is_small | (s.direction_lengths <= VANISHED_LENGTH)).all()
 
     def correct_unless_finished(carry, iteration):
-        """Apply the next correction; later ones are relaxed, and the last one is along conserved functions only."""
+        """Apply the next correction unless the iteration has finished; return the new carry, and None for the scan.
+
+        Later corrections are relaxed, and the last one is along conserved functions only.
+        """
         s, is_finished = carry
         is_relaxed, is_last = (
             iteration >= max_corrections - 1,
@@ -248,7 +251,7 @@ def project_onto_levels(
             current, end_gradients = apply_correction(current)
             current = current._replace(
                 level_residual=jnp.where(
-                    is_relaxed, drop_monotone_residuals(current).level_residual, current.level_residual
+                    is_relaxed, drop_allowed_monotone_residuals(current).level_residual, current.level_residual
                 )
             )
             direction_mask = (signs == 0.0) | ~is_relaxed | ((current.level_residual != 0.0) & ~is_last)
@@ -311,7 +314,7 @@ def project_onto_levels(
     start_vectors: list[jax.Array] = []
     if work_direction is not None:
         begin = x + compensation
-        start_vectors = change_vectors_at(begin, start_gradients)
+        start_vectors = gradient_vectors_at(begin, start_gradients)
     zero_residual = jnp.zeros(len(laws))
     start_d, start_correction = (jnp.zeros_like(d), -d) if follow_leaf else (d, jnp.zeros_like(d))
     s = with_next_correction(
@@ -344,10 +347,10 @@ def correction_directions(
     """Return the directions, along the surface, in which functions with these gradients at x are corrected.
 
     With ``follow_leaf`` they are directions of the covectors that carry the state along its leaf. The first
-    ``momentum_dim`` components are a momentum of constant length: see :func:`_small_momentum_weights`.
+    ``momentum_dim`` components are a momentum of constant length: see :func:`_weights_vanishing_with_momentum`.
     """
     if momentum_dim:
-        weights = _small_momentum_weights(system, x, momentum_dim)
+        weights = _weights_vanishing_with_momentum(system, x, momentum_dim)
         gradients = [weights * gradient for gradient in gradients]
     if follow_leaf:
         gradients = [_symplectic_leaf_direction(system, x, gradient) for gradient in gradients]
@@ -362,7 +365,7 @@ def _symplectic_leaf_direction(system: System, x, gradient) -> jax.Array:
     return jnp.where(is_at_rest & (jnp.arange(direction.size) < n), 0.0, direction)
 
 
-def level_correction(
+def level_correction_vector(
     system: System,
     directions: Sequence[jax.Array],
     changes: jax.Array,
@@ -381,10 +384,10 @@ def correction_displacement(
     """
     if follow_leaf:
         return system.poisson.leaf_displacement(x, -correction)
-    return _small_momentum_weights(system, x, momentum_dim) * correction if momentum_dim else correction
+    return _weights_vanishing_with_momentum(system, x, momentum_dim) * correction if momentum_dim else correction
 
 
-def _small_momentum_weights(system: System, x, momentum_dim: int) -> jax.Array:
+def _weights_vanishing_with_momentum(system: System, x, momentum_dim: int) -> jax.Array:
     """Return weights of the components, shape (n,), that vanish on a momentum near zero: a correction moves it less.
 
     The first ``momentum_dim`` components are the momentum, of constant length. Near zero the gradient of its length
@@ -400,7 +403,7 @@ def _small_momentum_weights(system: System, x, momentum_dim: int) -> jax.Array:
 def project_implicit_step(
     system: System, surface: Surface, invariants: Sequence[Energy], x, compensation, d, is_noisy: bool = False
 ) -> jax.Array:
-    """Project the displacement of an implicit step, which already obeys the laws, onto the surface.
+    """Return the displacement d of an implicit step, which already obeys the laws, projected onto the surface.
 
     The functions ``invariants`` and a conserved energy stay constant. Other functions with a law keep the change that
     they have, unless noise drives the step: then they have no law. The result is NaN if the projection fails.

@@ -13,7 +13,7 @@ from manifolds._pytree_module import forward_to
 from ..functions.gradients import DiscreteGradient, discrete_gradient_by_name
 from ..systems import System
 from ..systems.transport import has_generator
-from .base import OneStepMethod, TransportingMethod, collocation_error_estimate, generator_residual_jvp, register
+from .base import OneStepMethod, TransportingMethod, collocation_error_estimate, generator_field_residual_jvp, register
 from .charts import wrap_in_charts
 
 
@@ -93,7 +93,7 @@ class MetriplecticMidpoint(TransportingMethod):
     def residual_jvp(self, system: System, x, compensation, h, k) -> Callable:
         if not has_generator(system):
             return super().residual_jvp(system, x, compensation, h, k)
-        return generator_residual_jvp(system, lambda k: x + (compensation + 0.5 * h * k), k)
+        return generator_field_residual_jvp(system, lambda k: x + (compensation + 0.5 * h * k), k)
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
         return collocation_error_estimate(system, x, compensation, h, k)

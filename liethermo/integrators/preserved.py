@@ -63,6 +63,12 @@ def casimir_residuals(system_and_functions: tuple[System, tuple[Energy, ...]], x
     return jnp.nan_to_num(jnp.stack(residuals))
 
 
-def is_momentum_map(residuals: np.ndarray) -> np.ndarray:
-    """Return which functions are no Casimirs, from :func:`casimir_residuals` at points: (..., points, functions)."""
+def non_casimir_mask(residuals: np.ndarray) -> np.ndarray:
+    """Return whether each function fails the test of a Casimir, shape (..., functions).
+
+    Parameters
+    ----------
+    residuals : array, shape (..., points, functions)
+        Values of :func:`casimir_residuals` at several points.
+    """
     return residuals.max(axis=-2) > CASIMIR_RTOL

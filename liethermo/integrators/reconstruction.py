@@ -142,7 +142,9 @@ class WithAttitude(MethodWrapper):
     def initial_compensation(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
         layout = system.attitude_layout
         mu, g = layout.split_state(x)
-        attitude_correction = _correction_onto_group(system.group, g) if self.kind == "cayley" else jnp.zeros_like(g)
+        attitude_correction = (
+            _additive_correction_onto_group(system.group, g) if self.kind == "cayley" else jnp.zeros_like(g)
+        )
         momentum = jnp.zeros_like(layout.impulse(x)) if system.torque_laws.name else None
         return layout.join_state(self.method.initial_compensation(system.body, mu), attitude_correction, momentum)
 
@@ -156,7 +158,7 @@ class WithAttitude(MethodWrapper):
         )
         new_mu, new_mu_compensation = self.method.move(system.body, mu, mu_compensation, h, system.body_states(k))
         if self.explicit:
-            return self._apply_explicit_step(system, x, compensation, new_mu, new_mu_compensation, h, k)
+            return self._move_by_explicit_step(system, x, compensation, new_mu, new_mu_compensation, h, k)
         xi = (
             h
             * self._checked_inner_method.stage_velocities(system.body, mu, mu_compensation, h, k)[:, : system.group.dim]
@@ -168,16 +170,19 @@ class WithAttitude(MethodWrapper):
             dg = (g + g_compensation) @ _collocation_increment(system.group.algebra.hat(xi))
             new_g, new_g_compensation = two_sum(g, g_compensation + dg)
             return layout.join_state(new_mu, new_g, p), layout.join_state(
-                new_mu_compensation, new_g_compensation + _correction_onto_group(system.group, new_g), p_compensation
+                new_mu_compensation,
+                new_g_compensation + _additive_correction_onto_group(system.group, new_g),
+                p_compensation,
             )
         new_g = system.group.restore_map(g @ self._attitude_increment(system.group, xi))
         return layout.join_state(new_mu, new_g, p), layout.join_state(
             new_mu_compensation, jnp.zeros_like(g), p_compensation
         )
 
-    def _apply_explicit_step(
+    def _move_by_explicit_step(
         self, system: AttitudeSystem, x, compensation, new_mu, new_mu_compensation, h, k
     ) -> tuple[jax.Array, jax.Array]:
+        """Return the state after an explicit step and its compensation, from the new momentum and its compensation."""
         layout = system.attitude_layout
         g, group, n = layout.split_state(x)[1], system.group, system.group.dim
         local, step = AttitudeChartSystem(system, self.order, g), self.increment(h, k)
@@ -340,8 +345,8 @@ RESTORE_FRACTION = 2.0**-6
 """Fraction of the correction to the group that a step applies where the correction is mere rounding of the entries."""
 
 
-def _correction_onto_group(group, g) -> jax.Array:
-    """Return the correction, to be added, that brings an attitude g back to its group.
+def _additive_correction_onto_group(group, g) -> jax.Array:
+    """Return the matrix, shape (m, m), that added to an attitude g brings it back to its group.
 
     A correction of the size of rounding is no error of the step, since the compensation holds the rounding. Applied in
     full at every step it would add up, in one direction while the body spins steadily: to 1e-12 in 1e6 steps.

@@ -91,4 +91,5 @@ class Reference:
 
 @jit_cached
 def _vector_field(system: System, x):
+    """Return the vector field of a system at the state x, shape (n,)."""
     return system.vector_field(x)

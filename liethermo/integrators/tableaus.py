@@ -174,6 +174,7 @@ def lobatto_nodes_and_weights(n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _legendre_value(m: int, x) -> np.ndarray:
+    """Return the Legendre polynomial ``P_m`` at x, of the shape of x."""
     return np.polynomial.legendre.Legendre.basis(m)(x)
 
 

@@ -105,6 +105,7 @@ class MetriplecticTaylor(ExplicitMethod):
 
     @property
     def _lobatto_rule(self) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes and weights on [0, 1] of the Lobatto quadrature of the order of the method."""
         return lobatto_nodes_and_weights((self.order + 1) // 2 + 1)
 
     def check(self, system: System) -> None:
@@ -162,11 +163,11 @@ class MetriplecticTaylor(ExplicitMethod):
         return row_weights
 
     def error(self, system: System, x, compensation, h, k) -> jax.Array:
-        """Estimate the error from the residual of the polynomial X at its end: ``h |f(X(1)) - X'(1)| / (p + 1)``.
+        """Return an estimate of the error, shape (), from the residual of X: ``h |f(X(1)) - X'(1)| / (p + 1)``.
 
         At the end of a step the first neglected term of X' is p + 1 times that of X, so the ratio of estimate and
-        error tends to 1 with h. It
-        also detects a condition (``jnp.where``) whose value has changed inside the step.
+        error tends to 1 with h. The residual is also large if the value of a condition (``jnp.where``) has changed
+        inside the step.
         """
         return h * jnp.max(
             jnp.abs(convert_work_error_to_displacement(system, x, k[StepRow.ERROR], k[StepRow.MEAN_SLOPE]))

@@ -22,7 +22,7 @@ from ..dissipation.base import Dissipation
 from ..dissipation.factor import Factor
 from ..functions.energy import Energy, Pullback, float64_array
 from ..functions.indices import Indices
-from ..tracing.programs import jit_subprogram
+from ..tracing.programs import jit_if_traced
 
 
 class Poses(NamedTuple):
@@ -452,19 +452,19 @@ class KineticEnergy(Energy):
         return jax.lax.stop_gradient(_kinetic_rounding_scale(self, x))
 
 
-@jit_subprogram
+@jit_if_traced
 def _kinetic_energy(kinetic: KineticEnergy, x) -> jax.Array:
     return kinetic.mechanism.kinetic_energy(*kinetic.split_state(x))
 
 
-@jit_subprogram
+@jit_if_traced
 def _kinetic_gradient(kinetic: KineticEnergy, x) -> jax.Array:
     motion = kinetic.mechanism.motion(*kinetic.split_state(x))
     velocity = [] if kinetic.mechanism.is_fixed else [motion.angular_velocity]
     return jnp.concatenate([*velocity, motion.joint_gradient, motion.joint_rates])
 
 
-@jit_subprogram
+@jit_if_traced
 def _kinetic_rounding_scale(kinetic: KineticEnergy, x) -> jax.Array:
     return kinetic.mechanism.motion(*kinetic.split_state(x)).rounding_scale
 
@@ -493,12 +493,12 @@ class WeightPotential(Energy):
         return jax.lax.stop_gradient(_weight_potential_rounding_scale(self, x))
 
 
-@jit_subprogram
+@jit_if_traced
 def _weight_potential(potential: WeightPotential, x) -> jax.Array:
     return potential.mechanism.weight_potential(x[: potential.mechanism.n_joints], potential.gravity)
 
 
-@jit_subprogram
+@jit_if_traced
 def _weight_potential_rounding_scale(potential: WeightPotential, x) -> jax.Array:
     mechanism, q = potential.mechanism, x[: potential.mechanism.n_joints]
     strokes = jnp.where(np.array(mechanism.slides), jnp.abs(q), 0.0)
@@ -507,7 +507,7 @@ def _weight_potential_rounding_scale(potential: WeightPotential, x) -> jax.Array
     return jnp.linalg.norm(potential.gravity) * jnp.dot(mechanism.masses, arms)
 
 
-@jit_subprogram
+@jit_if_traced
 def _weight_gradient(potential: WeightPotential, x) -> jax.Array:
     k = potential.mechanism.n_joints
     return jnp.concatenate([-potential.mechanism.weight_forces(x[:k], potential.gravity), jnp.zeros(k)])

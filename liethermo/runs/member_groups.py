@@ -19,7 +19,7 @@ import numpy as np
 from manifolds._pytree_module import replace_fields
 
 from ..integrators import OneStepMethod
-from ..integrators.preserved import casimir_residuals, is_momentum_map, nonconservation_message
+from ..integrators.preserved import casimir_residuals, non_casimir_mask, nonconservation_message
 from ..systems import System
 from ..systems.conservation import function_rates_of_change, judge_conservation
 from ..systems.interface import InvariantVerdicts
@@ -231,7 +231,7 @@ class _MemberInvariantTests:
         points = self.member.samples(4)
         values_per_member = points.size * len(self.requested_functions)
         return self._evaluate_in_batches(
-            lambda rows: is_momentum_map(
+            lambda rows: non_casimir_mask(
                 self._evaluate_at_member_points(
                     _casimir_residuals_of_requested_functions,
                     rows,

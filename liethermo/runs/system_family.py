@@ -20,7 +20,7 @@ from ..functions.conditions import checked_host_numbers
 from ..models.inertia import are_inertia_tensors
 from ..systems import System
 from ..systems.kind_checks import require_system
-from ..tracing.caching import fingerprint
+from ..tracing.caching import pytree_key_or_none
 from ..tracing.interpret import evaluate_at_points
 from ..tracing.traced import TracedFunction, trace_function
 from .named_parameters import checked_parameters, reasons_of_refused_members, require_parameter, stack_member_arrays
@@ -149,7 +149,7 @@ class Family:
                 "the function that builds systems must accept traced JAX arrays, as under jax.vmap; or give a system "
                 f"and parameters= by the names of its own: {str(error).splitlines()[0]}"
             ) from error
-        if fingerprint(static_part) is None:
+        if pytree_key_or_none(static_part) is None:
             return self
         n_builder_arrays = self.n_builder_arrays
 
@@ -163,7 +163,7 @@ class Family:
 
         values = [*self.parameter_arrays, *(np.asarray(number)[None] for number in program.numbers)]
         form = ProgramStructure(
-            (program.program, fingerprint(static_part)), tuple(value.shape[1:] for value in values), rebuild
+            (program.program, pytree_key_or_none(static_part)), tuple(value.shape[1:] for value in values), rebuild
         )
         return replace(self, program_structure=form, parameter_arrays=values)
 

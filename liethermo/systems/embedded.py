@@ -24,7 +24,7 @@ from ..functions.checks import with_polynomial_degrees
 from ..functions.energy import Energy
 from ..functions.surface import ConstraintSurface
 from ..tracing.interpret import evaluate_at_points
-from ..tracing.programs import jit_subprogram
+from ..tracing.programs import jit_if_traced
 from .base import System
 from .domain import Domain
 from .interface import EngineHints, WrappedSystem
@@ -176,7 +176,7 @@ class _TangentDissipation(LiftedDissipation):
         return self.inner.factor_divergence(self.manifold_system, system.constraint_surface.project_state(x))
 
 
-@jit_subprogram
+@jit_if_traced
 def _tangent_force(dissipation: _TangentDissipation, x, dH, dS, dL) -> jax.Array:
     """Return the force of the inner dissipation, projected to the tangent space of the level sets, shape (n,)."""
     geometry = dissipation.lifted_geometry(dissipation.manifold_system, x)
@@ -247,7 +247,7 @@ def _tangential_part(system: System, x, w):
     return _tangential_part_in_space(_space_of(system), x, w)
 
 
-@jit_subprogram
+@jit_if_traced
 def _tangential_part_in_space(space: mf.Space, x, w):
     """Return an array w without the component that would change the constraints of a space."""
     return space.to_vector(space._tangential_part(space.from_vector(x), space.from_vector(w)))

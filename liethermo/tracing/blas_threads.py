@@ -30,8 +30,8 @@ MAX_SINGLE_THREAD_ROWS = 128
 """Largest number of rows of a matrix that is factorised by one thread; more threads are of use for larger ones."""
 
 
-def uses_one_blas_thread(jaxpr: Jaxpr) -> bool:
-    """Return whether a program factorises matrices that BLAS would divide among threads, and all of them are small."""
+def needs_one_blas_thread(jaxpr: Jaxpr) -> bool:
+    """Return whether a program factorises matrices that BLAS would divide among threads, though all are small."""
     row_counts = [
         max(equation.invars[0].aval.shape[-2:])
         for equation, _ in iterate_equations(jaxpr)

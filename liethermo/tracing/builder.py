@@ -73,13 +73,14 @@ def _saturating_int64(a) -> np.ndarray:
     return np.where(is_in_range, np.where(is_in_range, a, 0.0).astype(np.int64), limit)
 
 
-def _integer_quotient(a, n):
+def _truncated_quotient(dividend, divisor):
     """Return the quotient of integers, rounded towards zero; division by zero gives -1, as in XLA."""
-    a, n = np.asarray(a, dtype=np.int64), np.asarray(n, dtype=np.int64)
-    divisor = np.where(n == 0, 1, n)
-    floor_quotient = a // divisor
-    quotient = floor_quotient + ((floor_quotient * divisor != a) & ((a < 0) != (divisor < 0)))
-    return np.where(n == 0, -1, quotient)[()]
+    dividend, divisor = np.asarray(dividend, dtype=np.int64), np.asarray(divisor, dtype=np.int64)
+    is_zero = divisor == 0
+    divisor = np.where(is_zero, 1, divisor)
+    floor_quotient = dividend // divisor
+    quotient = floor_quotient + ((floor_quotient * divisor != dividend) & ((dividend < 0) != (divisor < 0)))
+    return np.where(is_zero, -1, quotient)[()]
 
 
 def _wrap_integer(a, bits: int, is_signed: bool):
@@ -141,7 +142,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = (
         "int": lambda a: np.asarray(a, dtype=np.int64),
         "truncate": _saturating_int64,
         "branch": lambda condition, number: condition,
-        "quotient": _integer_quotient,
+        "quotient": _truncated_quotient,
         "wrap": _wrap_integer,
         "single": lambda a: (
             np.float64(np.float32(a)) if np.ndim(a) == 0 else np.asarray(a, np.float32).astype(np.float64)
@@ -483,14 +484,17 @@ class ProgramBuilder:
         return self.op("min", a, b)
 
     def logistic(self, a):
+        """Return ``1 / (1 + exp(-a))``."""
         return self.div(1.0, self.add(1.0, self.op("exp", self.neg(a))))
 
     def round_half_away(self, a):
+        """Return the integer nearest to a real number; halves are rounded away from zero."""
         truncation = self.op("trunc", a)
         rounds_away = self.op("ge", self.op("abs", self.sub(a, truncation)), 0.5)  # false at infinity
         return self.select(rounds_away, self.add(truncation, self.op("sign", a)), truncation)
 
     def all(self, conditions):
+        """Return the scalar that is true if all conditions are."""
         result: Scalar = True
         for condition in conditions:
             result = self.op("and", result, condition)

@@ -106,7 +106,7 @@ class _ArgumentContent(NamedTuple):
     Attributes
     ----------
     key : hashable
-        Its :func:`fingerprint`; None if it has none, or is too large to be compared.
+        Its :func:`pytree_key_or_none`; None if it has none, or is too large to be compared.
     n_bytes : int
         Size of its arrays.
     is_changeable : bool
@@ -131,13 +131,13 @@ def _cached_content(argument: Any) -> _ArgumentContent:
         return _ArgumentContent(None, 0, is_changeable=True)
     n_bytes = sum(leaf.nbytes for leaf in leaves if eqx.is_array(leaf))
     content = _ArgumentContent(
-        fingerprint(argument) if n_bytes <= MAX_COMPARED_BYTES else None, n_bytes, is_changeable=False
+        pytree_key_or_none(argument) if n_bytes <= MAX_COMPARED_BYTES else None, n_bytes, is_changeable=False
     )
     # the entry holds the argument, so that no other object takes its id
     return _content_cache.get_or_compute(id(argument), lambda: (argument, content), n_bytes)[1]
 
 
-def fingerprint(tree: Any) -> Any:
+def pytree_key_or_none(tree: Any) -> Any:
     """Return a key that distinguishes pytrees by the values of their arrays and by their other leaves.
 
     The result is None if a leaf cannot be hashed or is a tracer.

@@ -109,6 +109,7 @@ class ComplexBuilder:
         return r.mul(maximum, r.op("sqrt", r.add(1.0, r.mul(ratio, ratio))))
 
     def op(self, op: str, *args):
+        """Return the result of an operation; raise NotImplementedError if it has no rule for complex arguments."""
         r = self.real_builder
         if op in ("le", "lt", "ge", "gt") or op not in COMPLEX_OPERATIONS:  # operations on real numbers
             if any(isinstance(a, ComplexPair) for a in args):
@@ -134,6 +135,7 @@ class ComplexBuilder:
         return self.div(a, r.select(r.op("eq", modulus, 0.0), 1.0, modulus))
 
     def _complex_from_polar(self, modulus, angle):
+        """Return ``modulus * exp(i angle)``."""
         r = self.real_builder
         return ComplexPair(r.mul(modulus, r.op("cos", angle)), r.mul(modulus, r.op("sin", angle)))
 

@@ -84,7 +84,7 @@ def _write_jaxpr(write: Callable[[bytes], Any], jaxpr: Jaxpr, digest_of: Callabl
 
 
 def _array_type_text(aval: Any) -> bytes:
-    """Return the type of an abstract array as a text."""
+    """Return dtype, shape and weak type of an abstract array as a text; raise _Unidentifiable for any other value."""
     if not isinstance(aval, jax.core.ShapedArray):
         raise _Unidentifiable
     return f"{aval.dtype}{aval.shape}{aval.weak_type};".encode()
@@ -111,7 +111,7 @@ def _write_value(write: Callable[[bytes], Any], value: Any, digest_of: Callable[
         write(digest_of(value))
     elif value is None or kind in (bool, str, bytes):
         write(f"{value!r};".encode())
-    elif isinstance(value, int | float | complex) and (kind in NUMBERS or _is_known_type(kind)):
+    elif isinstance(value, int | float | complex) and (kind in NUMBERS or _is_library_or_jax_type(kind)):
         write(f"{next(number for number in NUMBERS if isinstance(value, number)).__repr__(value)};".encode())
     elif isinstance(value, np.dtype | enum.Enum):
         write(f"{value};".encode())
@@ -122,18 +122,18 @@ def _write_value(write: Callable[[bytes], Any], value: Any, digest_of: Callable[
         write(f"{array.dtype}{array.shape};".encode() + array.tobytes())
     elif isinstance(value, dict):
         _write_value(write, [item for key in sorted(value) for item in (key, value[key])], digest_of)
-    elif kind in (tuple, list) or (isinstance(value, tuple) and _is_known_type(kind)):
+    elif kind in (tuple, list) or (isinstance(value, tuple) and _is_library_or_jax_type(kind)):
         write(b"%d;" % len(value))
         for item in value:
             _write_value(write, item, digest_of)
-    elif dataclasses.is_dataclass(value) and _is_known_type(kind):
+    elif dataclasses.is_dataclass(value) and _is_library_or_jax_type(kind):
         for field in dataclasses.fields(value):
             _write_value(write, getattr(value, field.name), digest_of)
     else:
         raise _Unidentifiable
 
 
-def _is_known_type(kind: type) -> bool:
+def _is_library_or_jax_type(kind: type) -> bool:
     """Return whether a type is defined by this library or by JAX, whose versions are known."""
     return kind.__module__.split(".")[0] in ("manifolds", "liethermo", "jax")
 
@@ -143,7 +143,7 @@ SOURCE_ROOMS = ("liethermo/tracing", "liethermo/engines", "manifolds")
 
 
 @functools.cache
-def compiler_fingerprint() -> bytes | None:
+def compiler_source_fingerprint() -> bytes | None:
     """Return a digest of the code that translates traced programs, and of the versions of JAX and llvmlite.
 
     None if the source files cannot be read.

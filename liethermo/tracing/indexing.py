@@ -13,17 +13,17 @@ from .builder import LimitExceededError, Scalar, map_elementwise, scalar_array
 Index = tuple[int, ...]
 
 
-def _flat_window_index_and_candidates(
+def _candidate_index_and_windows(
     builder, shape: Index, starts: Sequence[Scalar], sizes: Index
 ) -> tuple[Scalar, list[tuple]]:
-    """Return the flat index of the window with these starts, and the list of windows that this index counts.
+    """Return the index of a window among the candidate windows, and the list of these candidates.
 
     The index is a scalar that may be known at run time only. A window that sticks out of the array is moved inside.
     """
-    return _flat_window_index(builder, shape, starts, sizes), _candidate_windows(shape, starts, sizes)
+    return _candidate_window_index(builder, shape, starts, sizes), _candidate_windows(shape, starts, sizes)
 
 
-def _flat_window_index(builder, shape: Index, starts: Sequence[Scalar], sizes: Index) -> Scalar:
+def _candidate_window_index(builder, shape: Index, starts: Sequence[Scalar], sizes: Index) -> Scalar:
     """Return the index of a window among :func:`_candidate_windows`, a scalar that may be known at run time only."""
     window_number: Scalar = 0
     for s, n, m in zip(starts, shape, sizes, strict=True):
@@ -60,7 +60,7 @@ def read_window(builder, x: np.ndarray, starts: Sequence[Scalar], sizes: Index) 
     """Unroll ``dynamic_slice``: return the entries of x in the window with these starts, shape ``sizes``."""
     if builder is builder.real_builder and any(type(s) is str for s in starts):
         return _read_window_by_shared_tables(builder, x, starts, sizes)
-    window_number, windows = _flat_window_index_and_candidates(builder.real_builder, x.shape, starts, sizes)
+    window_number, windows = _candidate_index_and_windows(builder.real_builder, x.shape, starts, sizes)
     if len(windows) == 1:
         return x[windows[0]]
     entries = zip(*(x[window].ravel().tolist() for window in windows), strict=True)
@@ -69,7 +69,7 @@ def read_window(builder, x: np.ndarray, starts: Sequence[Scalar], sizes: Index) 
 
 def _read_window_by_shared_tables(builder, x: np.ndarray, starts: Sequence[Scalar], sizes: Index) -> np.ndarray:
     """Return the real entries in a window at run-time indices, read from tables that all reads of one array share."""
-    window_number = _flat_window_index(builder, x.shape, starts, sizes)
+    window_number = _candidate_window_index(builder, x.shape, starts, sizes)
     key = id(x), tuple(sizes), tuple(None if type(s) is str else int(s) for s in starts)
     if key not in builder.prepared_windows:
         windows = _candidate_windows(x.shape, starts, sizes)
@@ -86,7 +86,7 @@ def update_window_in_place(
     builder, x: np.ndarray, starts: Sequence[Scalar], sizes: Index, change: Callable, condition: Scalar = True
 ) -> None:
     """Replace the entries of x in the window with these starts by ``change(entries)`` where the condition holds."""
-    window_number, windows = _flat_window_index_and_candidates(builder.real_builder, x.shape, starts, sizes)
+    window_number, windows = _candidate_index_and_windows(builder.real_builder, x.shape, starts, sizes)
     for i, window in enumerate(windows):
         is_hit = (
             builder.real_builder.op("and", condition, builder.real_builder.op("eq", window_number, i))

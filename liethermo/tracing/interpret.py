@@ -19,7 +19,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from manifolds._arrays import is_traced
 
-from .caching import LRUCache, fingerprint, memoize
+from .caching import LRUCache, memoize, pytree_key_or_none
 from .index_check import check_indices
 from .programs import jit_unoptimised
 from .scalarize import UnsupportedPrimitive, scalarize
@@ -113,7 +113,7 @@ MAX_DEGREE_INSTRUCTIONS = 8_000
 
 
 def evaluate_at_points(function: Callable, pytree: Any, points: np.ndarray) -> Any:
-    """Return ``function(model, x)`` for each x of ``points``, shape (m, n), as arrays whose first axis is the points.
+    """Return ``function(pytree, x)`` for each x of ``points``, shape (m, n), as arrays whose first axis is the points.
 
     Parameters
     ----------
@@ -175,9 +175,10 @@ def make_batch_evaluator(function: Callable, pytree: Any, dim: int) -> Callable[
 
 
 def polynomial_degree_bound(function: Callable, pytree: Any, dim: int) -> float:
-    """Return an upper bound of the degree of ``function(model, x)`` in x, shape (dim,), for any parameters.
+    """Return an upper bound of the degree of ``function(pytree, x)`` in x, shape (dim,), for any parameters.
 
-    The bound is infinite if the function is not written as a polynomial. The arrays of the model are the parameters.
+    The bound is infinite if the function is not written as a polynomial. The float64 arrays of the pytree are the
+    parameters.
     """
     leaves, model_key, rebuild = _parameters_key_and_rebuilder(pytree)
 
@@ -198,10 +199,10 @@ def polynomial_degree_bound(function: Callable, pytree: Any, dim: int) -> float:
 
 
 def vanishing_entry_indices(function: Callable, pytree: Any, *shapes: tuple[int, ...]) -> frozenset[int]:
-    """Return the indices of the entries of ``function(model, *arrays)`` that are zero for any values of arrays.
+    """Return the indices of the entries of ``function(pytree, *arrays)`` that are zero for any values of arrays.
 
-    The arrays of the model are the parameters. Entries are counted in row-major order. The result is empty for a
-    function that cannot be unrolled or that closes over a tracer.
+    The float64 arrays of the pytree are the parameters. Entries are counted in row-major order. The result is empty for
+    a function that cannot be unrolled or that closes over a tracer.
     """
     leaves, model_key, rebuild = _parameters_key_and_rebuilder(pytree)
 
@@ -218,14 +219,15 @@ def vanishing_entry_indices(function: Callable, pytree: Any, *shapes: tuple[int,
 
 
 def _parameters_key_and_rebuilder(pytree: Any) -> tuple[list, Any, Callable]:
-    """Return the parameters of a model (its float64 arrays), a key of all else, and a function that rebuilds it."""
-    dynamic, static = eqx.partition(pytree, _is_parameter)
+    """Return the parameters of a pytree (its float64 arrays), a key of all else, and a function that rebuilds it."""
+    dynamic, static = eqx.partition(pytree, _is_float64_array)
     leaves, structure = jax.tree_util.tree_flatten(dynamic)
-    model_key = fingerprint(static), structure, tuple(np.shape(leaf) for leaf in leaves)
+    model_key = pytree_key_or_none(static), structure, tuple(np.shape(leaf) for leaf in leaves)
     return leaves, model_key, lambda arrays: eqx.combine(jax.tree_util.tree_unflatten(structure, arrays), static)
 
 
-def _is_parameter(leaf) -> bool:
+def _is_float64_array(leaf) -> bool:
+    """Return whether a leaf of a pytree is a float64 array."""
     return eqx.is_inexact_array(leaf) and leaf.dtype == np.float64
 
 
@@ -235,7 +237,7 @@ _unrolled_cache: LRUCache[Any] = LRUCache(128)
 def _cached_result_or_none(result_name: str, key: tuple, compute: Callable) -> Any:
     """Return ``compute()``, cached by the name of the result and a key; None if the function cannot be unrolled.
 
-    The key begins with a function and the key of a model.
+    The key begins with a function and the key of a pytree, whose first entry is None if nothing is to be cached.
     """
 
     def compute_or_none():

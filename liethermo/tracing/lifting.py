@@ -270,11 +270,13 @@ def _debug_info_without_names(jaxpr: Jaxpr) -> DebugInfo:
 
 
 def _is_inexact(aval) -> bool:
+    """Return whether an abstract value holds real or complex numbers."""
     dtype = aval_dtype(aval)
     return dtype is not None and jnp.issubdtype(dtype, jnp.inexact)
 
 
 def _is_large_float64(var: Var) -> bool:
+    """Return whether a variable is a float64 array of more than MAX_INLINE_NUMBERS entries."""
     aval: Any = var.aval
     return aval_dtype(aval) == np.float64 and aval.size > MAX_INLINE_NUMBERS
 

@@ -125,7 +125,7 @@ def eigh(builder, eqn, a):
 
 
 def _swap_row_with_pivot(builder, matrix: np.ndarray, row: int, pivot_row: Scalar) -> np.ndarray:
-    """Return a matrix with row k and row ``pivot_row`` exchanged, where ``pivot_row >= row``."""
+    """Return a copy of a matrix with the rows ``row`` and ``pivot_row`` exchanged, where ``pivot_row >= row``."""
     matrix, row_k, candidate_rows = matrix.copy(), matrix[row].copy(), matrix[row:].copy()
     for j in range(matrix.shape[1]):
         matrix[row, j] = builder.pick(builder.real_builder.sub(pivot_row, row), list(candidate_rows[:, j]))

@@ -91,6 +91,7 @@ class PythonCall(Module):
         return jax.pure_callback(self._evaluate_in_python, result, *arguments, vmap_method="sequential")
 
     def _evaluate_in_python(self, *arguments) -> np.ndarray:
+        """Return the value of the function, shape (); if it raises, store the exception and return NaN."""
         try:
             return np.asarray(self.function(*map(np.asarray, arguments)), dtype=np.float64).reshape(())
         except Exception as error:

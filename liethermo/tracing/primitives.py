@@ -230,6 +230,7 @@ def _count_nonzero_products(rows: np.ndarray, columns: np.ndarray) -> int:
 
 
 def _is_zero(a: Scalar) -> bool:
+    """Return whether a scalar is a constant that equals zero."""
     components = (a.re, a.im) if isinstance(a, ComplexPair) else (a,)
     return all(type(component) is not str and component == 0 for component in components)
 

@@ -145,10 +145,10 @@ class Program:
         input_index : int
             Index of the input array.
         """
-        return self._output_degree_bound(dict.fromkeys(self.inputs[input_index], 1))
+        return self._propagate_degrees(dict.fromkeys(self.inputs[input_index], 1))
 
-    def _output_degree_bound(self, degrees: dict[Scalar, float]) -> float:
-        """Return the largest degree of an output; add the degree of each instruction to ``degrees``."""
+    def _propagate_degrees(self, degrees: dict[Scalar, float]) -> float:
+        """Add the degree of each instruction to ``degrees``, given those of inputs; return the largest of an output."""
         for target, op, args in self.instructions:
             argument_degrees = [degrees.get(a, 0) for a in args]
             if op in ("add", "sub", "neg", "table", "item", "column"):
@@ -156,7 +156,7 @@ class Program:
             elif op == "mul" or isinstance(op, MatrixProduct):
                 degrees[target] = sum(argument_degrees)
             elif isinstance(op, Routine):
-                degrees[target] = op.program._output_degree_bound(
+                degrees[target] = op.program._propagate_degrees(
                     dict(zip(op.program.inputs[0], argument_degrees, strict=True))
                 )
             elif op == "div" and not argument_degrees[1]:

@@ -29,7 +29,7 @@ from manifolds._arrays import is_traced
 from manifolds.errors import warn
 
 from .. import disk
-from .blas_threads import uses_one_blas_thread, with_one_blas_thread
+from .blas_threads import needs_one_blas_thread, with_one_blas_thread
 from .caching import LRUCache
 
 
@@ -58,8 +58,8 @@ def cache_folder() -> Path | None:
 
 
 @functools.cache
-def host_processor() -> tuple[str, str, str]:
-    """Return the LLVM names of this machine: target triple, CPU and features."""
+def host_triple_cpu_and_features() -> tuple[str, str, str]:
+    """Return the target triple, the CPU and its features, by their names in LLVM, of this machine."""
     import llvmlite.binding as llvm
 
     return llvm.get_process_triple(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
@@ -176,7 +176,7 @@ def jit_unoptimised(function: FunctionT) -> FunctionT:
     return _jit_with_options(function, UNOPTIMISED_XLA_OPTIONS)
 
 
-def jit_subprogram(function: FunctionT) -> FunctionT:
+def jit_if_traced(function: FunctionT) -> FunctionT:
     """Decorator: trace a function of pytrees once, as a jitted subprogram of every program that calls it.
 
     The function is called directly if no argument is traced, or if an argument cannot be hashed.
@@ -206,7 +206,9 @@ def _jit_with_options(function: FunctionT, options: dict | None) -> FunctionT:
         program = _program_cache.get_or_compute(
             (key, is_part_of_program),
             lambda: (
-                jax.jit(array_function) if is_part_of_program else _compile_or_load(array_function, dynamic, options)
+                jax.jit(array_function)
+                if is_part_of_program
+                else _compile_array_function(array_function, dynamic, options)
             ),
         )
         return program(dynamic)
@@ -226,7 +228,7 @@ MIN_STORED_COMPILE_SECONDS = 0.1
 """Shortest time in seconds of a compilation whose result is written to disk."""
 
 
-def _compile_or_load(function: Callable, arguments: tuple, options: dict | None) -> Callable:
+def _compile_array_function(function: Callable, arguments: tuple, options: dict | None) -> Callable:
     """Return the compiled program of a function of arrays, loaded from the cache on disk or compiled by XLA.
 
     On the CPU it runs with one BLAS thread where it factorises small matrices. The cache is found by the text of the
@@ -243,12 +245,15 @@ def _compile_or_load(function: Callable, arguments: tuple, options: dict | None)
     traced_program = jitted_function.trace(arguments)
     has_jax_cache = getattr(jax.config, "jax_compilation_cache_dir")  # noqa: B009
     lowered_program = traced_program.lower()
-    program = lowered_program.compile() if has_jax_cache else _load_or_compile(lowered_program, options)
-    return with_one_blas_thread(program) if uses_one_blas_thread(traced_program.jaxpr.jaxpr) else program
+    program = lowered_program.compile() if has_jax_cache else _load_or_compile_lowered(lowered_program, options)
+    return with_one_blas_thread(program) if needs_one_blas_thread(traced_program.jaxpr.jaxpr) else program
 
 
-def _load_or_compile(lowered_program: Any, options: dict | None) -> Callable:
-    """Load a program from the cache on disk, or compile it and write it there if its compilation takes long."""
+def _load_or_compile_lowered(lowered_program: Any, options: dict | None) -> Callable:
+    """Return the executable of a lowered program, loaded from the cache on disk or compiled.
+
+    A program whose compilation takes long is written to the cache.
+    """
     text = lowered_program.as_text()
     if "callback" in text:
         return lowered_program.compile()
@@ -267,7 +272,7 @@ XLA_SUFFIX = ".xla"
 
 
 def _load_stored_program(name: str, lowered_program: Any) -> Callable | None:
-    """Load the compiled program that was written to disk under ``name``; None if there is none that can be loaded."""
+    """Return the compiled program that was written to disk under ``name``; None if none can be loaded."""
     code = read_machine_code(name, XLA_SUFFIX)
     if code is None:
         return None
@@ -283,7 +288,7 @@ def _compiler_identity() -> str:
     """Return a text that identifies this machine and its compiler; XLA divides work among the cores it sees."""
     cores = disk.available_cores()
     flags = os.environ.get("XLA_FLAGS", "")
-    return f"{host_processor()} {cores} {jax.__version__} {jaxlib.__version__} {flags}"
+    return f"{host_triple_cpu_and_features()} {cores} {jax.__version__} {jaxlib.__version__} {flags}"
 
 
 def _strip_weak_type(array):

@@ -35,7 +35,7 @@ from .complex_numbers import ComplexBuilder, flatten_scalars, real_scalar_kinds,
 from .primitives import SUPPORTED_PARAMETERS, UNROLLING_RULES
 from .program import Program, ScanLoop, WhileLoop, eliminate_dead_code_and_rename
 from .routines import MIN_ROUTINE_INSTRUCTIONS, call_routine_or_unroll
-from .searches import aval_dtype, has_matrix_products
+from .searches import aval_dtype, has_large_matrix_products
 
 MAX_INSTRUCTIONS = 200_000
 """Largest number of instructions of a program: far more than compile in reasonable time."""
@@ -271,7 +271,7 @@ def _unroll_call(builder, inner, arguments: Sequence[np.ndarray]) -> list[np.nda
     """Unroll a jaxpr that an equation calls, as a routine if it has products of matrices; return its outputs."""
     if not isinstance(inner, ClosedJaxpr):
         return _unroll_jaxpr(builder, inner, (), arguments)
-    if has_matrix_products(inner.jaxpr):
+    if has_large_matrix_products(inner.jaxpr):
         return call_routine_or_unroll(builder, _unroll_jaxpr, inner, arguments)
     return _unroll_jaxpr(builder, inner.jaxpr, inner.consts, arguments)
 
@@ -386,9 +386,10 @@ class _LoopCarry:
 
     @property
     def arrays(self) -> list[np.ndarray]:
+        """Arrays of scalars of the carry."""
         return unflatten_scalars(iter(self.entries), self.avals)
 
-    def release_changed_constants(self, results: Sequence[np.ndarray]) -> str:
+    def release_constants_and_return_kinds(self, results: Sequence[np.ndarray]) -> str:
         """Turn constants of the carry that a pass changes into variables; return their kinds, "" if there are none."""
         changed_indices = [
             i
@@ -402,10 +403,12 @@ class _LoopCarry:
 
     @property
     def variable_indices(self) -> list[int]:
+        """Indices of the entries that are not constant."""
         return [i for i, a in enumerate(self.entries) if type(a) is str]
 
     @property
     def variable_kinds(self) -> tuple[str, ...]:
+        """Kinds of the entries that are not constant."""
         entry_kinds = real_scalar_kinds(self.avals)
         return tuple(entry_kinds[i] for i in self.variable_indices)
 
@@ -439,7 +442,7 @@ def _unroll_while_loop(builder, eqn, *arguments):
                 )
                 for x, old, aval in zip(results, carry.arrays, carry.avals, strict=True)
             ]
-        if not carry.release_changed_constants(results):
+        if not carry.release_constants_and_return_kinds(results):
             break
     is_running: Scalar = False
     for lane_test in test_values.ravel().tolist():
@@ -517,7 +520,7 @@ def _emit_scan_loop_if_long(builder, eqn, constants, carry_start, row_tables) ->
     passes_agree = not columns
     while True:
         pass_builder, results = scope.unroll_body(closed_jaxpr, [*loop_constants, *carry.arrays, *row])
-        if not (changed_kinds := carry.release_changed_constants(results[: len(carry_start)])):
+        if not (changed_kinds := carry.release_constants_and_return_kinds(results[: len(carry_start)])):
             break
         passes_agree = passes_agree and "i" not in changed_kinds
     if passes_agree or length > MAX_SHORT_LOOP_PASSES:

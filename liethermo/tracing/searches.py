@@ -35,7 +35,7 @@ def iterate_equations(jaxpr: Jaxpr, repetitions: int = 1, *, calls_only: bool = 
             yield from iterate_equations(inner, repetitions * params.get("length", 1), calls_only=calls_only)
 
 
-def has_matrix_products(jaxpr: Jaxpr) -> bool:
+def has_large_matrix_products(jaxpr: Jaxpr) -> bool:
     """Return whether a jaxpr contains a product of matrices that may become a loop."""
     return any(
         equation.primitive.name == "dot_general"

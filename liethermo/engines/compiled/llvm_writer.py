@@ -143,7 +143,7 @@ class ProgramWriter:
         if op == "pick":
             return select_entry(self, x, rest)
         if op == "quotient":
-            return self._integer_quotient(x, *rest)
+            return self._truncated_quotient(x, *rest)
         if is_real and op == "single":
             float32_type = ir.FloatType() if self.lanes == 1 else ir.VectorType(ir.FloatType(), self.lanes)
             return build.fpext(build.fptrunc(x, float32_type), self.double_type)
@@ -174,7 +174,7 @@ class ProgramWriter:
             return build.select(is_negative, self.constant(-1), is_positive)
         raise UnsupportedPrimitive(op, "of unknown origin", f"on {x.type}")
 
-    def _integer_quotient(self, x: ir.Value, n: ir.Value) -> ir.Value:
+    def _truncated_quotient(self, x: ir.Value, n: ir.Value) -> ir.Value:
         """Return the quotient of integers, rounded towards zero; -1 for the divisor 0."""
         build, one = self.builder, self.constant(1)
         is_zero, is_minus_one = (build.icmp_signed("==", n, self.constant(c)) for c in (0, -1))

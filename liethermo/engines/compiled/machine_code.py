@@ -17,7 +17,7 @@ import numpy as np
 from llvmlite import ir
 
 from ...tracing.program import Program
-from ...tracing.programs import host_processor, read_machine_code, write_machine_code
+from ...tracing.programs import host_triple_cpu_and_features, read_machine_code, write_machine_code
 from ...tracing.scalarize import UnsupportedPrimitive, report_compiler_faults, scalarize
 from . import lapack
 from .llvm_writer import FLOAT64, INT64, ProgramWriter
@@ -105,7 +105,7 @@ def _host_target_cpu_features_and_text() -> tuple[llvm.Target, str, str, str]:
     math_library = ctypes.util.find_library("m")
     if math_library:
         llvm.load_library_permanently(math_library)
-    triple, cpu, features = host_processor()
+    triple, cpu, features = host_triple_cpu_and_features()
     if cpu_variable := os.environ.get("LIETHERMO_CPU", ""):
         cpu, features = cpu_variable, ""
     version = ".".join(map(str, llvm.llvm_version_info))

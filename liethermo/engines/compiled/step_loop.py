@@ -22,7 +22,7 @@ from ...integrators.fluctuating import noise_dimension, with_noise_increments
 from ...systems.clock import system_between_breaks
 from ...tracing.caching import LRUCache
 from ...tracing.calls import deferred_p
-from ...tracing.fingerprint import compiler_fingerprint, program_fingerprint
+from ...tracing.fingerprint import compiler_source_fingerprint, program_fingerprint
 from ...tracing.program import Program
 from ...tracing.scalarize import report_compiler_faults, scalarize
 from ..adaptive_steps import ATTEMPT_FIELDS, attempt_step, initial_adaptive_state
@@ -279,7 +279,7 @@ class CompiledStepLoop:
 
     def _cache_key(self, *jaxprs: ClosedJaxpr) -> str:
         """Return a text that identifies the machine code of these programs in all processes, or "" if none can."""
-        fingerprints = [compiler_fingerprint(), *map(program_fingerprint, jaxprs)]
+        fingerprints = [compiler_source_fingerprint(), *map(program_fingerprint, jaxprs)]
         if None in fingerprints:
             return ""
         layout = self._layout.row_counts, self.field_names, self.saved_fields, self.lanes, self._is_explicit

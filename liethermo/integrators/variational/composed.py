@@ -51,7 +51,7 @@ class ComposedVariational(MethodWrapper):
 
         def weighted_mean(values) -> jax.Array:
             return (
-                sum(part * value for part, value in zip(map_weights[1:], values[1:], strict=True))
+                sum(weight * value for weight, value in zip(map_weights[1:], values[1:], strict=True))
                 + map_weights[0] * values[0]
             )
 
@@ -75,7 +75,7 @@ class ComposedVariational(MethodWrapper):
             return jnp.concatenate([step[None], jnp.zeros_like(k[1:])])
         mass_matrices = [inverse(_momentum_hessian(system, point, p)) for point in points]
         momentum_gap = weighted_mean(
-            [share * rate[p] - row[p] for share, rate, row in zip(end_fractions, rates, k[1:], strict=True)]
+            [fraction * rate[p] - row[p] for fraction, rate, row in zip(end_fractions, rates, k[1:], strict=True)]
         )
         momentum_velocity = weighted_mean([M @ dH[p] for M, dH in zip(mass_matrices, gradients, strict=True)])
         V = inverse(weighted_mean(mass_matrices)) @ (h * momentum_gap + momentum_velocity)

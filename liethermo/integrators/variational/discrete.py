@@ -46,7 +46,7 @@ class FiniteDifference(Module):
     beta : float, optional
         0 to 1; alpha by default.
     weight : float, > 0
-        Beside other maps, with which a discretisation takes the mean of its values.
+        Weight of the map in the mean of several maps.
     """
 
     alpha: float = eqx.field(static=True)
@@ -63,9 +63,11 @@ class FiniteDifference(Module):
         self.alpha, self.beta, self.weight = float(alpha), float(beta), float(weight)
 
     def position(self, q0, V, h) -> jax.Array:
+        """Return the position at the map's point, shape (n,), from ``V = (q_1 - q_0) / h``."""
         return q0 + (self.alpha * h) * V
 
     def velocity(self, q0, V, h) -> jax.Array:
+        """Return the velocity at the map's point, shape (n,), from ``V = (q_1 - q_0) / h``."""
         del q0, h
         return V
 
@@ -107,6 +109,7 @@ class Curve(Module):
         return vector(q), vector(v)
 
     def _project_to_space(self, q) -> jax.Array:
+        """Return the point of the space next to the array q, shape (n,), by Newton's method."""
         point = self.space.from_vector(q)
         for _ in range(PROJECTION_NEWTON_STEPS):
             point = self.space._restore(point)

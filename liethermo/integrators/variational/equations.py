@@ -13,7 +13,9 @@ from ...tracing.programs import jit_cached
 from .discrete import DiscreteSystem, Pair
 
 
-def newton_step(discrete: DiscreteSystem, start_velocity, p0, guess: Pair) -> tuple[jax.Array, jax.Array]:
+def newton_velocity_and_entropy_slope(
+    discrete: DiscreteSystem, start_velocity, p0, guess: Pair
+) -> tuple[jax.Array, jax.Array]:
     """Return the velocity V and the entropy slope s after one Newton step for (3.12); exact if (3.12) is affine."""
     n, (q0, V, S0, s) = len(guess.V), guess
     mass = mass_scale(discrete.system, q0, start_velocity, S0)
@@ -74,7 +76,7 @@ def velocity_slope(system: SimpleClosedSystem, start, end, force, h) -> jax.Arra
 def _restrict_to_tangent_space(
     system: SimpleClosedSystem, q, v, mass_matrix, residual, h=1.0
 ) -> tuple[jax.Array, jax.Array]:
-    """Restrict the matrix and the residual (over h) of an equation for a momentum to velocities v tangent to Q."""
+    """Return matrix and residual (over h) of an equation for a momentum, restricted to velocities tangent to Q."""
     space = system.configurations
     if space is None:
         return mass_matrix, residual

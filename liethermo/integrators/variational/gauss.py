@@ -28,9 +28,9 @@ class VariationalGauss(GaussMethod):
     ``S_i = S_0 + h sum A_ij s_j``; q, p and S end with the weights b. One stage is scheme 2 with alpha = 1/2.
 
     The entropy falls at no step, ``S_1 - S_0 = h sum b_i s_i`` with positive b_i and T_i, for every L, friction and
-    step: a composition of order 4 has to step backward, where friction would cool. The energy is not kept; its error
-    is of order 2s and stays bounded (measured; see the tests). Symplectic where nothing depends on S. One implicit
-    equation of s times the size of the state, by fixed-point iteration or Newton's method.
+    step: a composition of order 4 has to step backward, where friction would cool. The energy is not
+    conserved; its error is of order 2s and stays bounded (measured; see the tests). The method is symplectic where
+    nothing depends on S. A step solves one implicit equation of s times the size of the state.
 
     Parameters
     ----------

@@ -158,13 +158,13 @@ class _LieStep(NamedTuple):
     h: jax.Array
     t: jax.Array
 
-    def _midpoint(self, y) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return the velocity xi, and the entropy and the time in the middle of the step."""
+    def _midpoint_arguments(self, y) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return the arguments of the forces: the velocity xi, the entropy and the time in the middle of the step."""
         return y[:-1], self.S0 + 0.5 * self.h * y[-1], self.t + 0.5 * self.h
 
     def momenta(self, y) -> tuple[jax.Array, jax.Array]:
         """Return the momenta mu at the start and at the end of the step."""
-        xi, S, t = self._midpoint(y)
+        xi, S, t = self._midpoint_arguments(y)
         force = self.system.friction_force(xi, S, t) + self.system.external_force(xi, S, t)
         mu, impulse = self.system.momentum(xi, S), 0.5 * self.h * force
         mu_start, mu_end = (self._apply_dtau_inverse_transpose(sign * self.h * xi, mu) for sign in (1.0, -1.0))
@@ -185,14 +185,14 @@ class _LieStep(NamedTuple):
 
         s is the entropy rate, f the friction, xi the velocity, and P_H the heat power.
         """
-        xi, S, t = self._midpoint(y)
+        xi, S, t = self._midpoint_arguments(y)
         T = -jax.grad(self.system.lagrangian, argnums=1)(xi, S)
         power = jnp.dot(self.system.friction_force(xi, S, t), xi) - self.system.heating(xi, S, t)
         return jnp.where(T > 0.0, T, jnp.nan) * y[-1] + power
 
     def work_and_heat_rates(self, y) -> tuple[jax.Array, jax.Array]:
         """Return the work and the heat received from outside, per unit of time."""
-        middle = self._midpoint(y)
+        middle = self._midpoint_arguments(y)
         return jnp.dot(self.system.external_force(*middle), y[:-1]), self.system.heating(*middle)
 
 

@@ -29,7 +29,7 @@ from ..base import (
 from ..charts import resolve_retraction
 from .composed import ComposedVariational
 from .discrete import Curve, DiscreteSystem, FiniteDifference, Pair
-from .equations import newton_step, velocity_from_momentum, velocity_slope
+from .equations import newton_velocity_and_entropy_slope, velocity_from_momentum, velocity_slope
 
 CONSTRAINT_TOLERANCE = 1e-10
 """Largest residual of a given first step, relative to its heat ``T |S_1 - S_0|`` plus its work."""
@@ -174,6 +174,7 @@ class VariationalIntegrator(OneStepMethod):
             require_simple_closed(system, "VariationalIntegrator")
 
     def _check_maps_for_composed_system(self, system: ComposedSystem) -> None:
+        """Raise InputError unless the maps suit a composed system, and its exchange of particles if it has any."""
         if not (self.phi == self.forces == self.constraint):
             raise InputError(f"for several bodies the maps of forces and constraint must be phi, and {self} has others")
         if any(type(map) is not FiniteDifference for map in self.phi):
@@ -210,7 +211,7 @@ class VariationalIntegrator(OneStepMethod):
         n = system.degrees_of_freedom
         q0, v0, S0, t = system.split_state(x + compensation)
         discrete, p0 = self.discrete_system(system, h, t), system.momentum(q0, v0, S0)
-        V, s = newton_step(discrete, v0, p0, Pair(q0, k[0, :n], S0, k[0, 2 * n]))
+        V, s = newton_velocity_and_entropy_slope(discrete, v0, p0, Pair(q0, k[0, :n], S0, k[0, 2 * n]))
         pair = Pair(q0, V, S0, s)
         v_dot = velocity_slope(
             system, (q0, v0, S0, p0), (q0 + h * V, k[0, n : 2 * n], S0 + h * s), discrete.momentum_slope(p0, pair), h
@@ -259,7 +260,7 @@ class VariationalIntegrator(OneStepMethod):
             checked_numbers(S0, "S0", ()),
         )
         S1_used = discrete.end_entropy_on_constraint(q0, q1, S0) if S1 is None else checked_numbers(S1, "S1", ())
-        residual, scale = (float(a) for a in _constraint_residual(discrete, q0, q1, S0, S1_used))
+        residual, scale = (float(a) for a in _constraint_residual_and_scale(discrete, q0, q1, S0, S1_used))
         if not residual <= CONSTRAINT_TOLERANCE * scale:
             raise InputError(
                 f"this first step is not on the discrete constraint: |P_d| = {residual:.3g}, with heat and work of "
@@ -341,10 +342,12 @@ SYMMETRIC_RETRACTION_TYPES = (
 
 
 def _simple_closed_or_none(system: System) -> SimpleClosedSystem | None:
+    """Return the system if it is a simple closed system, else None."""
     return system if isinstance(system, SimpleClosedSystem) else None
 
 
 def _composed_or_none(system: System) -> ComposedSystem | None:
+    """Return the system if it is a composed system, else None."""
     return system if isinstance(system, ComposedSystem) else None
 
 
@@ -383,7 +386,7 @@ def _is_symmetric_set(maps: tuple[FiniteDifference, ...]) -> bool:
 
 
 @jit_cached
-def _constraint_residual(discrete: DiscreteSystem, q0, q1, S0, S1):
+def _constraint_residual_and_scale(discrete: DiscreteSystem, q0, q1, S0, S1):
     """Return the absolute residual of the constraint ``P_d``, and its scale: the heat plus the work of the step."""
     pair = discrete.pair(q0, q1, S0, S1)
     residual, slope = jax.jvp(lambda s: discrete.constraint_residual(pair._replace(s=s)), (pair.s,), (jnp.ones(()),))

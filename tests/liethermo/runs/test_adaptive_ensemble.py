@@ -95,7 +95,7 @@ def test_a_trajectory_does_not_depend_on_its_neighbours(engine, monkeypatch):
     assert_same_ensembles(default_run, run(order), order)
     assert_same_ensembles(default_run, run(np.arange(5)), slice(5))
     monkeypatch.setattr(ensemble_lanes, "THREAD_BATCH_SIZE", 8)
-    monkeypatch.setattr(adaptive_ensemble, "ARRAY_BATCH_SIZE", 16)
+    monkeypatch.setattr(ensemble_lanes, "ARRAY_BATCH_SIZE", 16)
     monkeypatch.setattr(adaptive_ensemble, "ATTEMPTS_PER_CALL_RANGE", (1, 3))
     assert_same_ensembles(default_run, run(np.arange(41)))
 

@@ -19,14 +19,19 @@ REQUIRED_ARGUMENTS = {
     "zeitlin": {"N": 4},
     "magnetic_fluid": {"N": 4},
     "tumbling_body": {"inertia": (3.0, 2.0, 1.5), "rate": 0.1},
+    "sorting_flow": {"target": (1.0, 2.0, 3.0)},
+    "toda_flow": {"n": 3},
 }
+
+NO_SYSTEMS = {"IdealMixture", "QuantisedSphere", "hermitian_matrix", "hermitian_state"}
+"""Public names of ``lt.models`` that are no systems and make none."""
 
 
 def system_builders():
     yield from ((f"so(3), {case.name}", lambda case=case: build(mf.so(3), case)) for case in DISSIPATIONS)
     yield from SYSTEMS.items()
     yield from ((f"simple closed, {name}", lambda name=name: ISOLATED_SYSTEMS[name]) for name in ISOLATED_SYSTEMS)
-    for name in sorted({*lt.models.__all__} - {"IdealMixture", "QuantisedSphere"}):  # which are no systems
+    for name in sorted({*lt.models.__all__} - NO_SYSTEMS):
         yield f"model {name}", functools.partial(getattr(lt.models, name), **REQUIRED_ARGUMENTS.get(name, {}))
 
 

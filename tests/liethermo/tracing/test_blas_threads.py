@@ -9,7 +9,7 @@ import pytest
 import threadpoolctl
 
 import liethermo as lt
-from liethermo.tracing.blas_threads import MAX_SINGLE_THREAD_ROWS, uses_one_blas_thread, with_one_blas_thread
+from liethermo.tracing.blas_threads import MAX_SINGLE_THREAD_ROWS, needs_one_blas_thread, with_one_blas_thread
 from liethermo.tracing.programs import jit_cached
 from manifolds.matrices.spectral import spectral
 
@@ -37,11 +37,11 @@ def thread_counts() -> set[int]:
 )
 def test_which_programs_use_one_thread(function, rows, expected):
     matrix = np.broadcast_to(np.eye(rows), (3, rows, rows)) if expected and rows == 20 else np.eye(rows)
-    assert uses_one_blas_thread(jax.make_jaxpr(function)(matrix).jaxpr) is expected
+    assert needs_one_blas_thread(jax.make_jaxpr(function)(matrix).jaxpr) is expected
 
 
 def test_matrix_functions_of_this_library_are_factorisations():
-    assert uses_one_blas_thread(jax.make_jaxpr(lambda a: spectral(jnp.exp, a))(np.eye(20)).jaxpr)
+    assert needs_one_blas_thread(jax.make_jaxpr(lambda a: spectral(jnp.exp, a))(np.eye(20)).jaxpr)
 
 
 def test_the_number_of_threads_is_restored_after_an_error_and_in_threads():

@@ -15,7 +15,7 @@ from liethermo.engines.compiled import machine_code, step_loop
 from liethermo.engines.compiled.engine import CompiledEngine
 from liethermo.runs.preparation import prepare_system_and_method
 from liethermo.tracing.caching import LRUCache
-from liethermo.tracing.fingerprint import compiler_fingerprint, program_fingerprint
+from liethermo.tracing.fingerprint import compiler_source_fingerprint, program_fingerprint
 from manifolds.matrices.exponential import expm
 from manifolds.matrices.spectral import spectral
 
@@ -93,10 +93,10 @@ def test_a_function_of_the_user_inside_an_equation_has_no_fingerprint():
 def test_fingerprints_are_those_of_another_process():
     script = (
         "from tests.liethermo.tracing.test_fingerprint import *\n"
-        "print([fingerprint(f).hex() for f in PROGRAMS.values()], compiler_fingerprint().hex())"
+        "print([fingerprint(f).hex() for f in PROGRAMS.values()], compiler_source_fingerprint().hex())"
     )
     output = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
-    expected = [fingerprint(f).hex() for f in PROGRAMS.values()], compiler_fingerprint().hex()
+    expected = [fingerprint(f).hex() for f in PROGRAMS.values()], compiler_source_fingerprint().hex()
     assert output.split() == f"{expected[0]} {expected[1]}".split()
 
 
@@ -152,7 +152,7 @@ def test_a_run_with_code_from_the_cache_unrolls_no_program(method, empty_cache, 
 def test_code_of_another_version_of_the_compiler_is_not_used(empty_cache, monkeypatch):
     states_of_run(body())
     assert len(list(empty_cache.glob("*.o"))) == 1
-    monkeypatch.setattr(step_loop, "compiler_fingerprint", lambda: b"another version")
+    monkeypatch.setattr(step_loop, "compiler_source_fingerprint", lambda: b"another version")
     states_of_run(body())
     assert len(list(empty_cache.glob("*.o"))) == 2
 

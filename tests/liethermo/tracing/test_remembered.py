@@ -11,7 +11,7 @@ import pytest
 import liethermo as lt
 import manifolds as mf
 from liethermo.tracing import programs
-from liethermo.tracing.caching import MAX_CACHED_RESULTS, LRUCache, fingerprint, memoize
+from liethermo.tracing.caching import MAX_CACHED_RESULTS, LRUCache, memoize, pytree_key_or_none
 
 
 def counting_function():
@@ -81,10 +81,10 @@ def test_a_run_sees_parameters_that_were_changed_in_place():
 
 def test_fingerprints():
     """Fingerprints compare arrays by value; an unhashable object has none."""
-    keys = [fingerprint(lt.MetriplecticGauss(2, preserve=lt.Quadratic(np.ones(3)))) for _ in range(2)]
+    keys = [pytree_key_or_none(lt.MetriplecticGauss(2, preserve=lt.Quadratic(np.ones(3)))) for _ in range(2)]
     assert keys[0] == keys[1]
-    assert keys[0] != fingerprint(lt.MetriplecticGauss(2, preserve=lt.Quadratic(2 * np.ones(3))))
-    assert fingerprint({1}) is None
+    assert keys[0] != pytree_key_or_none(lt.MetriplecticGauss(2, preserve=lt.Quadratic(2 * np.ones(3))))
+    assert pytree_key_or_none({1}) is None
 
 
 @pytest.mark.slow
