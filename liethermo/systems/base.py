@@ -125,7 +125,7 @@ class System(SystemInterface):
                 raise InputError(
                     f"{type(term).__name__} acts on baths. Give the system baths=lt.HeatBaths(...)"
                     if term.acts_on_baths_alone
-                    else f"{type(term).__name__} increases the entropy, so the system needs one. Give entropy="
+                    else f"{type(term).__name__} increases the entropy, so the system needs an entropy"
                 )
             if not term.can_act_on_baths:
                 raise InputError(

@@ -370,7 +370,7 @@ def test_a_friction_operator_drives_the_entropies_of_baths():
     )
     with pytest.raises(lt.InputError, match=r"\(3, 3\) matrix for a state of 3 components"):
         lt.MetriplecticSystem(mf.Canonical(1), oscillator, dissipation=lt.FrictionOperator(np.eye(2)), baths=baths)
-    with pytest.raises(lt.InputError, match=r"beside the entropies of its baths\. Give entropy="):
+    with pytest.raises(lt.InputError, match=r"besides the entropies of its baths\. Give entropy="):
         lt.LiePoissonSystem(mf.so(3), ANISOTROPIC_ENERGY, dissipation=lt.KillingDissipation(), baths=baths)
 
 

@@ -148,7 +148,7 @@ def stone():
 
 
 test_bad_input = refusal_test(
-    (lambda: lt.Subsystem(None, 3, species=1), "wall that moves a body of its own"),
+    (lambda: lt.Subsystem(None, 3, species=1), "moving wall as a body of its own"),
     (lambda: lt.ComposedSystem([stone(), stone()], membranes=[lt.Membrane(0, 1, 0.1)]), "has 0 kinds of particles"),
     (
         lambda: lt.ComposedSystem([stone()], membranes=[lt.Membrane(0, 0, 0.1)]),
