@@ -105,7 +105,7 @@ class Dissipation(Module):
 
     @property
     def terms(self) -> tuple[Dissipation, ...]:
-        """Summands of a sum; a tuple of this dissipation alone if it is no sum."""
+        """The summands of a sum, as a tuple; otherwise this dissipation alone."""
         return (self,)
 
     @property

@@ -107,7 +107,7 @@ class LandauLifshitz(Damping):
     def damping_force_and_energy_loss(
         self, spins: Spins, x, dH, sign=1.0, per_site: bool = False
     ) -> tuple[VectorComponents, jax.Array]:
-        """Return the force components on ``spins``, times a sign, and the rate at which the energy falls.
+        """Return the force components on ``spins`` and the rate at which the energy falls, both times ``sign``.
 
         The rate is that of all sites together, or with ``per_site`` of each site.
         """

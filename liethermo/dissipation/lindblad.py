@@ -71,7 +71,7 @@ class LindbladJumps(Dissipation):
             raise InputError("couplings must be a list of pairs (V, rate), such as [(V, 0.1)]")
         self.operators = tuple(_checked_operator(V, f"the jump operator V[{i}]") for i, (V, _) in enumerate(pairs))
         self.rates = tuple(
-            _checked_time_dependent_rate(rate, i) if callable(rate) else checked_rate(rate)
+            _rate_checked_at_start(rate, i) if callable(rate) else checked_rate(rate)
             for i, (_, rate) in enumerate(pairs)
         )
 
@@ -218,7 +218,7 @@ class _SquaredTimeFactor(Module):
         return jnp.asarray(self.factor(t)) ** 2
 
 
-def _checked_time_dependent_rate(rate: Callable, i: int) -> Callable:
+def _rate_checked_at_start(rate: Callable, i: int) -> Callable:
     """Return the rate of the jump operator V[i], a function of time, after a test at t = 0."""
     try:
         value = rate(0.0)

@@ -82,7 +82,7 @@ def is_hermitian(V) -> bool:
 
 
 def subtract_common_energy(H: np.ndarray) -> np.ndarray:
-    """Return a Hamiltonian less the energy that all levels have in common."""
+    """Return H minus a multiple of the identity: the lower of the two diagonal entries nearest to each other."""
     return H - lower_level_of_smallest_gap(np.diag(H).real) * np.eye(len(H))
 
 

@@ -105,17 +105,17 @@ class EngineWithFallback:
 
     def initial_run_state(self, x) -> State:
         """Return the state of a run that starts at x, shape (n,), after choosing the engine."""
-        self._choose_engine(lambda compiled: compiled.n_operations)
+        self._choose_engine(lambda compiled: compiled.n_operations_per_step)
         return self._call_with_fallback(lambda engine, _: engine.initial_run_state(x))
 
     def start(self, x) -> TrajectoryWithFallback:
         """Return a trajectory that starts at x, shape (n,); a trajectory started before becomes invalid."""
-        self._choose_engine(lambda compiled: compiled.n_operations)
+        self._choose_engine(lambda compiled: compiled.n_operations_per_step)
         return TrajectoryWithFallback(self, self._call_with_fallback(lambda engine, _: engine.start(x)))
 
     def compiled_trajectory(self, is_new: bool = False) -> CompiledTrajectory | None:
         """Return the trajectory of the compiled engine, a new one if ``is_new``; None if another engine was chosen."""
-        self._choose_engine(lambda compiled: compiled.n_operations)
+        self._choose_engine(lambda compiled: compiled.n_operations_per_step)
         if not isinstance(self._engine, CompiledEngine):
             return None
         return self._engine.new_trajectory() if is_new else self._engine.trajectory
@@ -170,7 +170,7 @@ class EngineWithFallback:
 
     def start_adaptive(self, control: StepControl, x, t: float, stop_time: float, span_length: float) -> AdaptiveRuns:
         """Return an adaptive run from x at time t, on the engine that is chosen for it."""
-        self._choose_engine(lambda compiled: compiled.adaptive_step_loop(control)[0].n_operations)
+        self._choose_engine(lambda compiled: compiled.adaptive_step_loop(control)[0].n_operations_per_step)
 
         def start_on_engine(engine: Engine, _) -> AdaptiveRuns:
             if isinstance(engine, CompiledEngine):
@@ -217,14 +217,14 @@ class EngineWithFallback:
         if self.requested_engine == "compiled" or (is_auto and is_worth_compiling(system, method)):
             compiled = CompiledEngine(system, method, planned_steps=self.planned_steps)
             try:
-                n_operations = count_operations(compiled)
-                if not is_auto and n_operations > SLOW_COMPILE_OPERATIONS:
+                n_operations_per_step = count_operations(compiled)
+                if not is_auto and n_operations_per_step > SLOW_COMPILE_OPERATIONS:
                     warn(
-                        f"a step of {n_operations:,} operations takes minutes to compile. Leave out engine=, or "
-                        "take engine='array', to start at once",
+                        f"a step of {n_operations_per_step:,} operations takes minutes to compile. Leave out engine=, "
+                        "or take engine='array', to start at once",
                         CompiledEngineWarning,
                     )
-                if n_operations <= MAX_AUTO_COMPILED_OPERATIONS or not is_auto or repays_compiling:
+                if n_operations_per_step <= MAX_AUTO_COMPILED_OPERATIONS or not is_auto or repays_compiling:
                     return compiled
             except UnsupportedPrimitive as error:
                 if not (is_auto and error.too_large):  # no warning: a program that is too large is expected with auto

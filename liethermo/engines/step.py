@@ -197,7 +197,7 @@ def stage_equations(
     options: SolverOptions = DEFAULT_OPTIONS,
     map_function: Callable | None = None,
 ) -> StageEquations:
-    """Return the stage equations of a step from x, with a guess extrapolated from the slopes of previous steps."""
+    """Return the stage equations of a step from x; their initial guess is extrapolated from earlier slopes."""
     components = system.subsystem_to_solve(x)[1]
     norm = options.norm_for_dim(components.size)
     state_rate = norm(components) / jnp.abs(h)  # computed once per step

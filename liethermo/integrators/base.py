@@ -253,11 +253,11 @@ class TransportingMethod(OneStepMethod):
     def can_transport_attitude(self, system: System) -> bool:
         """Return True if an attitude can follow the steps exactly, with the spatial momentum conserved to rounding.
 
-        It can if the slopes at Gauss nodes are Pi times :meth:`stage_velocities`, or if the steps of an explicit method
-        end on the coadjoint orbit on which they began.
+        It can if the slopes at Gauss nodes are Pi times :meth:`attitude_velocities_at_stages`, or if the steps of an
+        explicit method end on the coadjoint orbit on which they began.
         """
 
-    def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
+    def attitude_velocities_at_stages(self, system: System, x, compensation, h, k) -> jax.Array:
         """Return the velocities of an attitude at the stages, shape (stages, n), from the gradients of the step.
 
         They are those of :meth:`.System.attitude_velocity_from_gradients`.

@@ -107,7 +107,7 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
                 return slopes[None]
         return sum((B.times(w) for B, w in factors_and_inputs), system.field(z, dH, dS, dL))[None]
 
-    def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
+    def attitude_velocities_at_stages(self, system: System, x, compensation, h, k) -> jax.Array:
         z, dH, dS, dL = self.method.midpoint_and_gradients(system, x, compensation, h, k)
         factors_and_inputs = self._factors_and_drift_plus_noise(system, z, dH, dL, h)
         return sum(

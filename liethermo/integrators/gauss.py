@@ -225,7 +225,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
 
         This is for motions without dissipation whose held functions are all Casimirs.
         """
-        functions = self._held_functions(system) | _functions_determining_entropy(system)
+        functions = self._held_functions_by_name(system) | _functions_determining_entropy(system)
         casimirs = functions.keys() <= {ENTROPY_KEY, *self._casimir_names(system)}
         if system.total_dissipation.terms or not casimirs or all(C.is_quadratic for C in functions.values()):
             return None
@@ -233,7 +233,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         points = system.poisson.stages_on_leaf(x + compensation, dH, h * gauss_tableau(self.number).A)
         return None if points is None else jax.vmap(system.poisson.sharp)(points, dH)
 
-    def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
+    def attitude_velocities_at_stages(self, system: System, x, compensation, h, k) -> jax.Array:
         names = tuple(preserved_functions_by_number(system))
 
         def velocity(u, dH, dS, gradients_by_name):
@@ -261,7 +261,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         gradients_by_name = {
             name: discrete_and_continuous_gradients(C)
             for name, C in (
-                self._held_functions(system) | entropy_functions | preserved_functions_by_number(system)
+                self._held_functions_by_name(system) | entropy_functions | preserved_functions_by_number(system)
             ).items()
         }
         if S is None:
@@ -298,7 +298,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
 
     def _conservative_slope(self, system: System, u, dH, gradients_by_name: dict[str, StageGradients]) -> jax.Array:
         """Return ``Pi dH`` without the components that would change S or a held function."""
-        functions = self._held_functions(system) | _functions_determining_entropy(system)
+        functions = self._held_functions_by_name(system) | _functions_determining_entropy(system)
         if all(C.is_quadratic for C in functions.values()):
             return system.poisson.sharp(u, dH)
         gradients = [gradients_by_name[name] for name in functions]
@@ -349,7 +349,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
 
         These are all functions that it has to keep; none if it keeps all of them by construction.
         """
-        functions = self._held_functions(system) | (
+        functions = self._held_functions_by_name(system) | (
             _functions_determining_entropy(system) if term.energy_law == "nonincreasing" else {}
         )
         gradients_are_exact = system.energy.is_quadratic and (system.entropy is None or system.entropy.is_quadratic)
@@ -369,7 +369,8 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         names = preserved_function_names(system)
         terms = terms_with_preserved_values(system.total_dissipation.terms, names)
         has_only_quadratics = all(
-            C.is_quadratic for C in (self._held_functions(system) | _functions_determining_entropy(system)).values()
+            C.is_quadratic
+            for C in (self._held_functions_by_name(system) | _functions_determining_entropy(system)).values()
         )
         return has_only_quadratics and not any(
             self._functions_to_project_off(term, set(term_names), system) for term, term_names in terms
@@ -390,7 +391,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
             return False
         return system.total_dissipation.is_symmetric or system.functions()[name].is_quadratic
 
-    def _held_functions(self, system: System) -> dict[str, Energy]:
+    def _held_functions_by_name(self, system: System) -> dict[str, Energy]:
         """Return the functions that steps hold constant, by name: those of ``held``, and the user's ``preserve``."""
         functions = system.functions()
         user_functions = {f"given {i + 1}": C for i, C in enumerate(self.functions)}
@@ -398,7 +399,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
 
     def move(self, system: System, x, compensation, h, k) -> tuple[jax.Array, jax.Array]:
         return apply_increment(
-            self, system, x, compensation, self.increment(h, k), tuple(self._held_functions(system).values())
+            self, system, x, compensation, self.increment(h, k), tuple(self._held_functions_by_name(system).values())
         )
 
     def _casimir_names(self, system: System) -> set[str]:
@@ -411,7 +412,9 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
         if system.energy.is_quadratic:
             return None
         casimirs = self._casimir_names(system)
-        maps = [J for name, J in self._held_functions(system).items() if J.is_quadratic and name not in casimirs]
+        maps = [
+            J for name, J in self._held_functions_by_name(system).items() if J.is_quadratic and name not in casimirs
+        ]
         if not maps:
             return None
         sharp = system.poisson.sharp

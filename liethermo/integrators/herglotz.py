@@ -188,11 +188,11 @@ def _forward_substep_slope(action: Callable, contact: mf.SplitContact, y, h, gue
     n = len(guess)
     q, p, S = y[:n], y[n : 2 * n], y[2 * n]
 
-    def momentum_residual(q1):
+    def start_momentum_residual(q1):
         dL_dq, dL_dS = jax.grad(action, argnums=(0, 2))(q, q1, S, h)
         return dL_dq + (1.0 + dL_dS) * p
 
-    velocity = _newton_velocity(momentum_residual, contact, q, h, guess)
+    velocity = _newton_velocity(start_momentum_residual, contact, q, h, guess)
     q1 = q + h * velocity
     p1 = contact.tangential_part(q1, jax.grad(action, argnums=1)(q, q1, S, h))
     return jnp.concatenate([velocity, (p1 - p) / h, jnp.dot(velocity, p1)[None]])

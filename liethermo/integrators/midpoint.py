@@ -82,7 +82,7 @@ class MetriplecticMidpoint(TransportingMethod):
         dL = tuple(self.gradient(L, x, d, compensation) for L in system.preserved_functions)
         return z, dH, dS, dL
 
-    def stage_velocities(self, system: System, x, compensation, h, k) -> jax.Array:
+    def attitude_velocities_at_stages(self, system: System, x, compensation, h, k) -> jax.Array:
         return system.attitude_velocity_from_gradients(*self.midpoint_and_gradients(system, x, compensation, h, k))[
             None
         ]

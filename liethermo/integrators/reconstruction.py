@@ -161,7 +161,9 @@ class WithAttitude(MethodWrapper):
             return self._move_by_explicit_step(system, x, compensation, new_mu, new_mu_compensation, h, k)
         xi = (
             h
-            * self._checked_inner_method.stage_velocities(system.body, mu, mu_compensation, h, k)[:, : system.group.dim]
+            * self._checked_inner_method.attitude_velocities_at_stages(system.body, mu, mu_compensation, h, k)[
+                :, : system.group.dim
+            ]
         )
         p, p_compensation = (
             self._next_spatial_momentum(system, x, compensation, h, k, xi) if system.impulse_dim else (None, None)
@@ -235,7 +237,9 @@ class WithAttitude(MethodWrapper):
         )
         xi = (
             h
-            * self._checked_inner_method.stage_velocities(system.body, mu, mu_compensation, h, k)[:, : system.group.dim]
+            * self._checked_inner_method.attitude_velocities_at_stages(system.body, mu, mu_compensation, h, k)[
+                :, : system.group.dim
+            ]
         )
         if self.kind == "exp" or (self.kind == "coadjoint" and len(xi) > 1):
             return g @ group.exp_map(
@@ -367,7 +371,7 @@ step is taken."""
 
 
 def _project_onto_orbit(momentum_system, p, mu) -> jax.Array:
-    """Return the spatial momentum nearest to p with the Casimirs of mu; momenta of internal parts are unchanged."""
+    """Return a spatial momentum near p at which the Casimirs equal those at mu, with the internal momenta of mu."""
     n = len(p)
     scale = jnp.max(jnp.abs(mu[:n]))
     scale, casimirs = jnp.where(scale > 0.0, scale, 1.0), momentum_system.momentum_casimirs().values()

@@ -64,7 +64,7 @@ def soap_optimiser(array_shapes: Sequence[tuple[int, ...]], learning_rate: Calla
 
     def update(gradient, state, vector=None):
         count, mean, square, bases_and_means = state
-        grams = [_gram_matrices(gradient[indices].reshape(shape)) for indices, shape in matrices]
+        grams = [_left_and_right_gram_matrices(gradient[indices].reshape(shape)) for indices, shape in matrices]
         means = [
             [MEAN_DECAY * S + (1.0 - MEAN_DECAY) * P for (_, S), P in zip(pair, products, strict=True)]
             for pair, products in zip(bases_and_means, grams, strict=True)
@@ -93,7 +93,7 @@ def soap_optimiser(array_shapes: Sequence[tuple[int, ...]], learning_rate: Calla
     return optax.GradientTransformation(init, update)
 
 
-def _gram_matrices(gradient_matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _left_and_right_gram_matrices(gradient_matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the Gram matrices ``G G^T`` and ``G^T G`` of the gradient G by a weight matrix."""
     return gradient_matrix @ gradient_matrix.T, gradient_matrix.T @ gradient_matrix
 

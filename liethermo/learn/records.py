@@ -136,7 +136,7 @@ def read_data(
     >>> data.names, data[0].t
     (('angle',), array([0.   , 0.01 , 0.025]))
     """
-    table = _read_columns(source, trajectory, time)
+    table = _read_all_columns(source, trajectory, time)
     labels = _Labels(list(table), units or {})
     time_label = labels.find_time_label(time)
     group_label = None if trajectory is None else labels.find_label(trajectory, "trajectory=")
@@ -348,7 +348,7 @@ def _checked_table_trajectory(
 # -- sources ----------------------------------------------------------------------------------------------------------
 
 
-def _read_columns(source: Any, trajectory: str | None, time: str | None) -> dict[str, np.ndarray]:
+def _read_all_columns(source: Any, trajectory: str | None, time: str | None) -> dict[str, np.ndarray]:
     """Read all columns of a table as arrays of equal length, by label.
 
     Raises

@@ -97,7 +97,7 @@ class QuantisedSphere:
 
     @cached_property
     def _diagonal_index_tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Index tables between the components of a state and the entries [i, :, m] of the diagonals, with factors.
+        """Return source indices and factors that turn a state into the entries [i, :, m] of diagonals, and the reverse.
 
         The entries of the diagonals below are those above with the sign of an anti-Hermitian matrix, so that they have
         the same products with the basis. What stands on the main diagonal follows the components, or the entries.

@@ -179,7 +179,7 @@ class FixedEnsembleRun(EnsembleRun):
         engine_calls: Iterator[EngineCall],
         is_stopped: Callable[[], bool],
     ) -> None:
-        """Advance a batch of trajectories by the engine calls of a schedule, and record their states and ends."""
+        """Advance a batch of trajectories by the engine calls of a schedule; record the saved states and statuses."""
         record, group, first_save = self.record, self.group, 1
 
         def record_call(engine_call: EngineCall, first_step: int, saved_states: np.ndarray) -> bool:

@@ -224,7 +224,7 @@ class StepChecker:
         self.system, self.evaluate, self.replay, self.min_motion = system, evaluate, replay, min_motion
         self.n_substeps = n_replayed_steps(system.dim)
 
-    def add_error_and_inconsistency(self, evidence: Evidence, sample: StepSample) -> Evidence:
+    def with_error_and_inconsistency(self, evidence: Evidence, sample: StepSample) -> Evidence:
         """Return the evidence with local error and inconsistency added, unless the sampled steps do not move.
 
         At least one step of each trajectory is compared with its vector field.
@@ -480,7 +480,9 @@ class RunEvidenceSource:
         def evaluate(function: Callable, trajectory_indices: np.ndarray, states: np.ndarray) -> Any:
             return evaluate_at_points(function, self.system, states)
 
-        return StepChecker(self.system, evaluate, self.replay, min_motion).add_error_and_inconsistency(evidence, sample)
+        return StepChecker(self.system, evaluate, self.replay, min_motion).with_error_and_inconsistency(
+            evidence, sample
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -540,7 +542,7 @@ class GroupEvidenceSource:
         if not len(sample.h):
             return evidence
         checker = StepChecker(self.example_member, family.evaluate, self.replay, MIN_MOTION_FRACTION * self.distance)
-        return checker.add_error_and_inconsistency(evidence, sample)
+        return checker.with_error_and_inconsistency(evidence, sample)
 
     def _invariant_drifts_of_member(self, i: int, saved_states: np.ndarray) -> dict[str, InvariantDrift]:
         """Return the drifts along trajectory i of the invariants that the method promises to conserve, by name."""

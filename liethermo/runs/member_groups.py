@@ -190,7 +190,7 @@ class _MemberInvariantTests:
         return self._evaluate_in_batches(
             lambda rows: first_proportional_indices(
                 self._evaluate_at_member_points(
-                    _gradients_of_functions_for_naming, rows, self._rescaled_points_per_member(points, rows)
+                    _gradients_of_named_and_preserved_functions, rows, self._rescaled_points_per_member(points, rows)
                 ),
                 count,
             ),
@@ -387,7 +387,7 @@ def _unpack_member_and_state(
     return (system if test_time_index is None else systems_at_test_times(system)[test_time_index]), row[n_parameters:]
 
 
-def _gradients_of_functions_for_naming(model, row):
+def _gradients_of_named_and_preserved_functions(model, row):
     structure, n_parameters = model
     system, x = _unpack_member_and_state(structure, n_parameters, row)
     return stack_gradients(named_then_preserved_functions(system), x)

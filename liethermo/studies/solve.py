@@ -280,7 +280,7 @@ class PointSolver:
         for indices, (family, x0s, result) in ensembles:
             count = len(indices)
             self.laws, self.engine = result.laws, result.engine
-            summary, codes, texts = self._law_values_codes_and_messages(family, x0s, result)
+            summary, codes, texts = self._law_values_and_trajectory_outcomes(family, x0s, result)
             for name, measure in self.task.measures.items():
                 values, failures = measure(result, count)
                 values = np.where(
@@ -298,7 +298,7 @@ class PointSolver:
                     message[indices[i]] = text
         return PointResults(status, message, laws, measures)
 
-    def _law_values_codes_and_messages(
+    def _law_values_and_trajectory_outcomes(
         self, family: Any, x0s: np.ndarray, ensemble_result: Ensemble
     ) -> tuple[np.ndarray, np.ndarray, dict[int, str]]:
         """Return the law quantities of each trajectory, its status code, and its message by index."""

@@ -141,7 +141,7 @@ def traced_torque_and_argument_counts(
 
 
 def _argument_shapes(algebra: mf.LieAlgebra, group: mf.MatrixGroup | None) -> tuple[tuple[int, ...], ...]:
-    """Return the shapes of the real arguments of a torque: t, mu, velocity, and one or two for the attitude."""
+    """Return the shapes of the real arguments of a torque: t, mu, velocity, and of a complex attitude both parts."""
     shape = () if group is None else group.identity.shape
     # real and imaginary parts of complex groups are separate arguments: functions are traced for real arrays
     complex_group = group is not None and jnp.iscomplexobj(group.identity)

@@ -112,7 +112,7 @@ def check_equilibrium(
     exact_samples = (
         Samples(*samples)
         if samples is not None
-        else sample_equilibrium_measure(system, noise, starts[0], late_states, seed)
+        else weighted_equilibrium_samples(system, noise, starts[0], late_states, seed)
     )
     weights = np.asarray(exact_samples.weights) / np.sum(exact_samples.weights)
     effective_count = 1.0 / np.sum(weights**2)
@@ -142,7 +142,7 @@ def check_equilibrium(
     return suite.report()
 
 
-def sample_equilibrium_measure(
+def weighted_equilibrium_samples(
     system: System, noise: Fluctuations, x0, path_states: np.ndarray, seed: int = 0
 ) -> Samples:
     """Sample the exact equilibrium measure of :func:`check_equilibrium`; return independent points and their weights.

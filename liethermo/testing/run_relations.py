@@ -173,7 +173,7 @@ def special_values_of_parameter(value: np.ndarray) -> list[np.ndarray]:
 
 
 def final_state_of_member(ensemble_run: Ensemble, i: int) -> np.ndarray:
-    """Return the final state of one trajectory of an ensemble, shape (n,); zeros if it was not started."""
+    """Return the final state of one trajectory of an ensemble, shape (n,); NaN, as of one not started, becomes 0."""
     assert ensemble_run.x is not None
     return np.nan_to_num(ensemble_run.x[i]).ravel()
 

@@ -88,7 +88,7 @@ def memoize(function: Callable[..., Result]) -> Callable[..., Result]:
         entry = identity_cache.get(identities := tuple(map(id, arguments)))
         if entry is not None:
             return entry[1]
-        contents = tuple(map(_cached_content, arguments))
+        contents = tuple(map(_cached_key_and_size, arguments))
         if any(content.is_changeable for content in contents):
             return function(*arguments)
         n_bytes = sum(content.n_bytes for content in contents)
@@ -121,7 +121,7 @@ class _ArgumentContent(NamedTuple):
 _content_cache: LRUCache[tuple[Any, _ArgumentContent]] = LRUCache(MAX_CACHED_RESULTS, MAX_CACHED_BYTES)
 
 
-def _cached_content(argument: Any) -> _ArgumentContent:
+def _cached_key_and_size(argument: Any) -> _ArgumentContent:
     """Return the key and size of an argument's content, cached by the identity of the argument."""
     entry = _content_cache.get(id(argument))
     if entry is not None:

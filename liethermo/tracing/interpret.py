@@ -132,7 +132,7 @@ def make_batch_evaluator(function: Callable, pytree: Any, dim: int) -> Callable[
         return lambda points: _evaluate_compiled(function, pytree, points)
     if has_plain_functions_or_floats(pytree):
         pytree = trace_callables(pytree, function, (dim,))
-    leaves, model_key, rebuild = _parameters_key_and_rebuilder(pytree)
+    leaves, model_key, rebuild = _parameters_and_static_key_and_rebuilder(pytree)
     values = [np.asarray(leaf, dtype=np.float64) for leaf in leaves]
     zero_pattern = tuple((value == 0.0).tobytes() for value in values)  # zeros shorten the program
 
@@ -180,7 +180,7 @@ def polynomial_degree_bound(function: Callable, pytree: Any, dim: int) -> float:
     The bound is infinite if the function is not written as a polynomial. The float64 arrays of the pytree are the
     parameters.
     """
-    leaves, model_key, rebuild = _parameters_key_and_rebuilder(pytree)
+    leaves, model_key, rebuild = _parameters_and_static_key_and_rebuilder(pytree)
 
     def compute_degree() -> float:
         shapes = [jax.ShapeDtypeStruct(np.shape(leaf), np.float64) for leaf in leaves]
@@ -204,7 +204,7 @@ def vanishing_entry_indices(function: Callable, pytree: Any, *shapes: tuple[int,
     The float64 arrays of the pytree are the parameters. Entries are counted in row-major order. The result is empty for
     a function that cannot be unrolled or that closes over a tracer.
     """
-    leaves, model_key, rebuild = _parameters_key_and_rebuilder(pytree)
+    leaves, model_key, rebuild = _parameters_and_static_key_and_rebuilder(pytree)
 
     def find_vanishing_entries() -> frozenset[int]:
         arrays = [jax.ShapeDtypeStruct(shape, np.float64) for shape in (*map(np.shape, leaves), *shapes)]
@@ -218,7 +218,7 @@ def vanishing_entry_indices(function: Callable, pytree: Any, *shapes: tuple[int,
     return _cached_result_or_none("zeros", (function, model_key, shapes), find_vanishing_entries) or frozenset()
 
 
-def _parameters_key_and_rebuilder(pytree: Any) -> tuple[list, Any, Callable]:
+def _parameters_and_static_key_and_rebuilder(pytree: Any) -> tuple[list, Any, Callable]:
     """Return the parameters of a pytree (its float64 arrays), a key of all else, and a function that rebuilds it."""
     dynamic, static = eqx.partition(pytree, _is_float64_array)
     leaves, structure = jax.tree_util.tree_flatten(dynamic)

@@ -125,7 +125,7 @@ class _LiftedBody:
                         self._lift_number(value, var.aval) if inexact else self._keep_constant(Var(var.aval), value)
                     )
                 continue
-            inputs, params = self._lift_equation(eqn, inputs)
+            inputs, params = self._lifted_inputs_and_params(eqn, inputs)
             outputs = [type(v)(v.aval) for v in eqn.outvars]
             env.update(zip(eqn.outvars, outputs, strict=True))
             self.equations.append(eqn.replace(invars=inputs, outvars=outputs, params=params))
@@ -156,7 +156,7 @@ class _LiftedBody:
             return self._lift_number(value if isinstance(value, jax.Array) else np.asarray(value), var.aval)
         return self._keep_constant(Var(var.aval), value)
 
-    def _lift_equation(self, eqn: JaxprEqn, inputs: list) -> tuple[list, dict]:
+    def _lifted_inputs_and_params(self, eqn: JaxprEqn, inputs: list) -> tuple[list, dict]:
         """Return the inputs and parameters of an equation, with its numbers as variables."""
         name, params = eqn.primitive.name, dict(eqn.params)
         number_vars: list = []

@@ -104,9 +104,9 @@ def so(p: int, q: int = 0, *, by_matrices: bool | None = None) -> LieAlgebra:
         i, j, k = np.eye(3)
         return _algebra_from_basis(
             [
-                _outer_product(k, j) - _outer_product(j, k),
-                _outer_product(i, k) - _outer_product(k, i),
-                _outer_product(j, i) - _outer_product(i, j),
+                np.outer(k, j) - np.outer(j, k),
+                np.outer(i, k) - np.outer(k, i),
+                np.outer(j, i) - np.outer(i, j),
             ],
             "so(3)",
         )
@@ -406,10 +406,6 @@ for _kind, _h in [("VI", 0.0), ("VI", -0.25), ("VI", -0.5), ("VII", 0.0), ("VII"
     _registry.append((bianchi, (_kind,), {"h": _h}))
 _registry.append((lambda: direct_sum(so(3), heisenberg(1)), (), {}))
 _registry.append((lambda: semidirect_sum(sl(2), sl(2).basis, name="sl(2) x R^2"), (), {}))
-
-
-def _outer_product(row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    return np.outer(row, column)
 
 
 def _matrix_unit(n: int, i: int, j: int) -> np.ndarray:

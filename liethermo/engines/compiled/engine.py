@@ -153,9 +153,9 @@ class CompiledEngine:
         return cached_step_loop(self._structure, parameters, self._method, control, options=self._options), parameters
 
     @property
-    def n_operations(self) -> int:
+    def n_operations_per_step(self) -> int:
         """Number of scalar operations of a step, which measures the time to compile it."""
-        return self._step_loop.n_operations
+        return self._step_loop.n_operations_per_step
 
     @functools.cached_property
     def trajectory(self) -> CompiledTrajectory:

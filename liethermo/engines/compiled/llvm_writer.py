@@ -156,15 +156,15 @@ class ProgramWriter:
         if is_real and op == "exp":
             return write_exponential(self, x)
         if is_real and op in LLVM_INTRINSICS:
-            return self.call_intrinsic(f"llvm.{LLVM_INTRINSICS[op]}", args, self.double_type)
+            return self.call_intrinsic_on_lanes(f"llvm.{LLVM_INTRINSICS[op]}", args, self.double_type)
         if is_real and op in C_LIBRARY_FUNCTIONS:
             return self.call_per_lane(op, args)
         if is_real and op == "truncate":  # NaN becomes 0, and too large numbers the nearest integer
-            return self.call_intrinsic("llvm.fptosi.sat", args, self.int_type)
+            return self.call_intrinsic_on_lanes("llvm.fptosi.sat", args, self.int_type)
         if is_real and op == "is_finite":
             return build.fcmp_ordered("<", self.write_operation("abs", args), self.constant(np.inf))
         if is_real and op == "sign":  # NaN for NaN, a signed zero for a zero
-            signed_one = self.call_intrinsic("llvm.copysign", [self.constant(1.0), x], self.double_type)
+            signed_one = self.call_intrinsic_on_lanes("llvm.copysign", [self.constant(1.0), x], self.double_type)
             return build.select(build.fcmp_ordered("one", x, self.constant(0.0)), signed_one, x)
         if op in ("abs", "sign") and x.type == self.int_type:
             is_negative = build.icmp_signed("<", x, self.constant(0))
@@ -205,7 +205,7 @@ class ProgramWriter:
         (x, y), addend = factors, terms[1 - product_index]
         if op == "sub":
             x, addend = (x, self.builder.fneg(addend)) if product_index == 0 else (self.builder.fneg(x), addend)
-        return self.call_intrinsic("llvm.fmuladd", (x, y, addend), self.double_type)
+        return self.call_intrinsic_on_lanes("llvm.fmuladd", (x, y, addend), self.double_type)
 
     def nonnegative_max(self, x: ir.Value, y: ir.Value) -> ir.Value:
         """Return the maximum of two nonnegative numbers, NaN if either is, by comparing their bits."""
@@ -281,7 +281,7 @@ class ProgramWriter:
         convert = self.builder.uitofp if value.type == self.bool_type else self.builder.sitofp
         return convert(value, self.double_type)
 
-    def call_intrinsic(self, name: str, args: Sequence[ir.Value], return_type: ir.Type) -> ir.Value:
+    def call_intrinsic_on_lanes(self, name: str, args: Sequence[ir.Value], return_type: ir.Type) -> ir.Value:
         """Return the result of an LLVM intrinsic function on all lanes at once."""
         suffix = "" if self.lanes == 1 else f"v{self.lanes}"
         kinds = [f"{suffix}i64"] if return_type == self.int_type else []
@@ -476,7 +476,7 @@ def _write_fast_exponential(writer: Any, x: ir.Value) -> ir.Value:
     build = writer.builder
 
     def multiply_add(a: ir.Value, b: ir.Value, c: ir.Value) -> ir.Value:
-        return writer.call_intrinsic("llvm.fmuladd", (a, b, c), writer.double_type)
+        return writer.call_intrinsic_on_lanes("llvm.fmuladd", (a, b, c), writer.double_type)
 
     rounding_shift = writer.constant(ROUND_TO_INT_SHIFT)
     shifted_k = multiply_add(x, writer.constant(1.0 / math.log(2.0)), rounding_shift)

@@ -315,7 +315,7 @@ def _write_matrix_product_function(
             for (i, j), total in zip(entries, totals, strict=True):
                 own_factor = entry(0, i, l) if sums_run_over_rows else entry(1, l, j)
                 build.store(
-                    function_writer.call_intrinsic(
+                    function_writer.call_intrinsic_on_lanes(
                         "llvm.fmuladd", (own_factor, shared_factor, build.load(total)), function_writer.double_type
                     ),
                     total,

@@ -99,7 +99,7 @@ class CompiledStepLoop:
         Inputs of the initial state besides p and x; inputs of a step besides the fields.
     saved_fields : tuple of str
         Fields that are written out at each save.
-    n_operations : int
+    n_operations_per_step : int
         Number of scalar operations of a step with one iteration.
     """
 
@@ -161,13 +161,13 @@ class CompiledStepLoop:
         ]
         state_names = [name for name in (*self.field_names, "h") if name in first_rows]
         self._key = self._cache_key(self._step_jaxpr, self._initial_jaxpr)
-        self.n_operations = self._count_operations()
+        self.n_operations_per_step = self._count_operations()
         self._loops = CompiledLoops(
             lambda: write_step_loop(
                 self._programs, self._layout, state_names, is_per_trajectory, lanes, self.saved_fields
             ),
             self._key,
-            lanes == 1 and self.n_operations <= MAX_UNOPTIMISED_OPERATIONS,
+            lanes == 1 and self.n_operations_per_step <= MAX_UNOPTIMISED_OPERATIONS,
         )
 
     # -- what is compiled -----------------------------------------------------------------------------------------

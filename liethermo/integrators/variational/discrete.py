@@ -185,7 +185,7 @@ class DiscreteSystem(Module):
         return force_on_q0 - force_on_V / self.h, force_on_V / self.h
 
     def mean_lagrangian(self, q0, V, S0, s) -> jax.Array:
-        """Return ``L_d / h``, the weighted mean of the Lagrangian over the points of its maps."""
+        """Return ``L_d / h``, the weighted mean of the Lagrangian at the points of ``lagrangian_maps``."""
         points = self._points_of_maps(self.lagrangian_maps, Pair(q0, V, S0, s))
         return _sum_arrays([p.weight * self.system.lagrangian_value(p.q, p.v, p.S) for p in points])
 
@@ -200,7 +200,7 @@ class DiscreteSystem(Module):
             force_at_start, force_at_end = force_at_start + force_minus, force_at_end + force_plus
         return force_at_start, force_at_end
 
-    def momentum_residual(self, p0, pair: Pair) -> jax.Array:
+    def start_momentum_residual(self, p0, pair: Pair) -> jax.Array:
         """Return the residual of ``p_0 = -D_1 L_d - F^-_d``, (3.12) with the momentum of the last step, shape (n,)."""
         dL_dq, dL_dV = jax.grad(self.mean_lagrangian, argnums=(0, 1))(*pair)
         return p0 - dL_dV + self.h * (dL_dq + self.mean_end_forces(pair)[0])
@@ -210,7 +210,7 @@ class DiscreteSystem(Module):
 
         The distance is multiplied by a ``mass`` of the size of L_vv, so that the sum is a momentum.
         """
-        residual = self.momentum_residual(p0, pair)
+        residual = self.start_momentum_residual(p0, pair)
         if self.curve is None:
             return residual
         surface = ConstraintSurface(self.curve.space, tangent=True)
@@ -226,7 +226,7 @@ class DiscreteSystem(Module):
         """
         force_at_start, force_at_end = self.mean_end_forces(pair)
         force = jax.grad(self.mean_lagrangian)(*pair) + (force_at_start + force_at_end)
-        return force if self.curve is None else force - self.momentum_residual(p0, pair) / self.h
+        return force if self.curve is None else force - self.start_momentum_residual(p0, pair) / self.h
 
     def constraint_residual(self, pair: Pair) -> jax.Array:
         """Return the residual of the constraint, the mean of ``T s + F_fr . v - P_H``; NaN if T <= 0 [GBY 3.9]."""

@@ -106,12 +106,12 @@ def _momentum_of_v(fixed_arguments, v):
 def velocity_from_momentum(system: SimpleClosedSystem, q, S, p, velocity_guess):
     """Return v with ``L_v(q, v, S) = p``, near a guess; NaN if Newton's method does not converge."""
 
-    def momentum_residual(v):
+    def start_momentum_residual(v):
         return system.momentum(q, v, S) - p
 
     def tangent_jacobian_and_value(function, v):
         return _restrict_to_tangent_space(system, q, v, *jacobian_and_value(function, v))
 
-    v = newton_iterate(momentum_residual, velocity_guess, 20, tangent_jacobian_and_value)
-    residual = system.tangential_part(q, momentum_residual(v))
+    v = newton_iterate(start_momentum_residual, velocity_guess, 20, tangent_jacobian_and_value)
+    residual = system.tangential_part(q, start_momentum_residual(v))
     return nan_unless_small(v, residual, 1e-12 * (1.0 + jnp.max(jnp.abs(p))))

@@ -72,8 +72,8 @@ class VariationalGauss(GaussMethod):
 
         force, p, s, node_rates = jax.vmap(node_forces_and_rates)(q, V, S, t)
         W = jax.vmap(jax.jacfwd(system.momentum, argnums=1))(q, V, S)
-        momentum_residual = p0 + h * (A @ force) - p
-        V = V + jax.vmap(lambda W, r: solve(W, r[:, None])[:, 0])(W, momentum_residual)
+        start_momentum_residual = p0 + h * (A @ force) - p
+        V = V + jax.vmap(lambda W, r: solve(W, r[:, None])[:, 0])(W, start_momentum_residual)
         end = q0 + h * (b @ V), k[0, n : 2 * n], S0 + h * (b @ s)
         v_dot = velocity_slope(system, (q0, v0, S0, p0), end, b @ force, h)
         columns = [V, jnp.tile(v_dot, (self.number, 1)), s[:, None]]

@@ -10,7 +10,7 @@ from liethermo import testing
 from liethermo.integrators import fluctuating
 from liethermo.models.gases import GAS_CONSTANT, gas_piston_state
 from liethermo.testing import PropertyError, check_equilibrium
-from liethermo.testing.equilibrium import sample_equilibrium_measure
+from liethermo.testing.equilibrium import weighted_equilibrium_samples
 from tests.additions.group import LINE
 from tests.cases import slow_case
 
@@ -33,7 +33,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def draw_equilibrium_states(system, noise, number):
     """Return independent states in equilibrium, shape (number, 3)."""
-    exact, rng = sample_equilibrium_measure(system, noise, UP, np.zeros((2, 3))), np.random.default_rng(1)
+    exact, rng = weighted_equilibrium_samples(system, noise, UP, np.zeros((2, 3))), np.random.default_rng(1)
     return exact.points[rng.choice(len(exact.points), number, p=exact.weights / exact.weights.sum())]
 
 
@@ -197,7 +197,7 @@ def test_an_unknown_measure_is_refused():
         mf.direct_sum(mf.so(3), mf.so(3)), lt.Quadratic(np.arange(1.0, 7.0)), None, lt.DoubleBracket(0.1)
     )
     with pytest.raises(ValueError, match="give samples"):
-        sample_equilibrium_measure(spins, BATH, np.ones(6), np.zeros((2, 6)))
+        weighted_equilibrium_samples(spins, BATH, np.ones(6), np.zeros((2, 6)))
     ten_samples = np.tile(UP, (10, 1)), np.ones(10)
     with pytest.raises(ValueError, match="count as 10 alone"):
         check_equilibrium(SPIN, BATH, UP, 1.0, 0.1, paths=8, samples=ten_samples)
