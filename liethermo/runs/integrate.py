@@ -164,6 +164,6 @@ def solution_without_steps(system: System, x0, t: float, method: OneStepMethod) 
         If the method cannot start at x0.
     """
     problem = Problem.from_user(system, method, x0=x0)
-    run = Run(problem, problem.initial_state(x0, t), StepSchedule.of_zero_length(t), None, "auto", dense=True)
+    run = Run(problem, problem.initial_state(x0, t), StepSchedule.empty_schedule(t), None, "auto", dense=True)
     run.complete_without_steps()
     return run.solution_so_far()

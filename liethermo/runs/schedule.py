@@ -143,7 +143,7 @@ class StepSchedule:
         self.n_steps = sum(segment.n_steps for segment in self.segments)
 
     @classmethod
-    def of_zero_length(cls, t: float) -> StepSchedule:
+    def empty_schedule(cls, t: float) -> StepSchedule:
         """Return the schedule of a span of length zero at time t; it has no step."""
         schedule = cls.__new__(cls)
         schedule.start = schedule.end = t

@@ -79,7 +79,7 @@ class Units(NamedTuple):
         return factor * self.bohr_magneton / self.hbar
 
     def moment(self, magnetons=1.0):
-        """Return the magnetic moment of a number of Bohr ``magnetons``, in these units (energy / field)."""
+        """Return the magnetic moment, in these units (energy / field), of so many Bohr ``magnetons``."""
         return self.bohr_magneton * checked_numbers(magnetons, "a moment")
 
     def thermal_energy(self, temperature):

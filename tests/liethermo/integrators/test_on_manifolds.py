@@ -312,7 +312,7 @@ def test_a_step_beyond_the_injectivity_radius(build):
 def test_spaces_and_retractions_that_do_not_fit(build):
     with pytest.raises(lt.InputError, match="from_geomstats"):
         lt.MetriplecticSystem(SPIN, cubic, space=gs_hypersphere.Hypersphere(2))
-    with pytest.raises(lt.InputError, match="9 real components"):
+    with pytest.raises(lt.InputError, match="must have 9 coordinates, one for each real component"):
         lt.MetriplecticSystem(SPIN, cubic, space=mf.SpecialOrthogonal(3))
     with pytest.raises(lt.InputError, match="on R\\^n"):
         lt.integrate(lt.models.rigid_body(), START, (0, 1), 0.1, lt.MetriplecticMidpoint(retraction="exp"))

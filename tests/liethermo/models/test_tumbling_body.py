@@ -188,7 +188,7 @@ def test_noise_keeps_the_energy_the_size_of_the_momentum_and_the_momentum_in_spa
         (lambda: lt.models.tumbling_body((3, 2, 1.5), 1.0, (1.0, 2.0)), "one number, or three"),
         (lambda: lt.models.tumbling_body((3, 2, 1.5), 0.0, 1.0), "a relaxation time must be positive"),
         (lambda: lt.models.tumbling_body((2, 2, 2), 1.0, 1.0), "three equal moments"),
-        (lambda: lt.models.tumbling_body((3, 2, 1.5), rate=-1.0), "must be >= 0, got -1.0"),
+        (lambda: lt.models.tumbling_body((3, 2, 1.5), rate=-1.0), "must be >= 0 and finite, got -1.0"),
         (lambda: lt.models.tumbling_body((3, 2, 1.5), rate=1.0, capacity=0.0), "capacity of a bath must be positive"),
         (lambda: lt.models.tumbling_body((3, 2, -1.5), rate=1.0), "positive and finite"),
     ],

@@ -125,7 +125,7 @@ def test_a_file_of_an_earlier_version(solution, tmp_path):
         file.flush()
         with_checksum.write_bytes(path.read_bytes())
         file.attrs["format"] = "liethermo-solution-1"
-    with pytest.warns(UserWarning, match="no checksum"):
+    with pytest.warns(UserWarning, match="without a checksum"):
         assert have_equal_content(lt.load(path), solution)
     with pytest.raises(lt.FileError, match="checksum"):
         lt.load(with_checksum)

@@ -413,7 +413,7 @@ def test_units():
         (lambda: run(lt.VariationalGauss(2)), r"VariationalGauss runs only on R\^n. On a manifold use"),
         (lambda: run(V(Lazy(0.5))), "no subclass"),
         (lambda: run(lt.DiscreteHerglotz(lambda q0, q1, S0, h: S0)), "got a SimpleClosedSystem"),
-        (lambda: herglotz_pendulum().system.hamiltonian_system(), r"inverted on R\^n alone.*S\^2.*with space="),
+        (lambda: herglotz_pendulum().system.hamiltonian_system(), r"inverted on R\^n only.*S\^2.*with space="),
         (
             lambda: run(V.midpoint(retraction=mf.retraction(mf.Sphere(3), "exp"))),
             r"belongs to S\^3, but the system is on S\^2",

@@ -111,7 +111,7 @@ def test_functions_that_are_not_of_classes_are_refused(is_product):
         (
             lambda: mf.Homogeneous(mf.SO(3), [plane_generator(3, 0, 1), plane_generator(3, 1, 2)]),
             mf.ParameterError,
-            "not a subalgebra.*add what",
+            "not a subalgebra.*Add the missing directions",
         ),
         (
             lambda: mf.Homogeneous(mf.SO(3), [plane_generator(3, 0, 1)] * 2),
