@@ -290,8 +290,8 @@ def summary_sentences(comparisons: list[PeerComparison]) -> Iterator[str]:
     if drifts:
         ours_drifts, peer_drifts = zip(*drifts, strict=True)
         yield (
-            f"**conservation**: beside programs that run another scheme, the relative drift of the conserved quantity "
-            f"is at most {max(ours_drifts):.1e} with this library, and {min(peer_drifts):.1e} to "
+            f"**conservation**: compared with programs that run another scheme, the relative drift of the conserved "
+            f"quantity is at most {max(ours_drifts):.1e} with this library, and {min(peer_drifts):.1e} to "
             f"{max(peer_drifts):.1e} with the others ({len(drifts)} tasks)."
         )
 

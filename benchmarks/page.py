@@ -19,8 +19,9 @@ LEARNING_PAGE_NAME = "benchmarks_learning.md"
 INTRODUCTION = """\
 # Benchmarks
 
-How fast this library is beside other programs, and where it loses. A point left of the line is a task in which this
-library is faster. {{doc}}`benchmarks_learning` has the errors of learned systems.
+This page compares the speed of this library with that of other programs, and shows the tasks in which it is slower. A
+point left of the line is a task in which this library is faster. {{doc}}`benchmarks_learning` has the errors of learned
+systems.
 
 ![Time of this library over the time of another program, task by task, on a logarithmic axis](benchmarks.svg)
 

@@ -24,7 +24,8 @@ def check_memory(n_numbers: float, label: str, advice: str) -> None:
     n_bytes, memory = 8.0 * float(n_numbers), memory_bytes()
     if n_bytes > memory / 2:
         raise SizeError(
-            f"{label} would take {n_bytes / 1e9:.3g} GB, and this machine has {memory / 1e9:.3g} GB of memory; {advice}"
+            f"{label} would take {n_bytes / 1e9:.3g} GB, more than half of this machine's {memory / 1e9:.3g} GB of "
+            f"memory: {advice}"
         )
 
 

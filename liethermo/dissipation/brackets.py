@@ -391,7 +391,7 @@ def _check_semidefinite_on_pairs(form) -> None:
 
 
 def _check_curvature_symmetries(R) -> None:
-    """Raise InputError unless R has the symmetries of an algebraic curvature tensor."""
+    """Raise InputError unless R has the symmetries of a 4-bracket. The first Bianchi identity is not one of them."""
     if isinstance(R, jax.core.Tracer):
         return
     R = np.asarray(R)
@@ -403,4 +403,7 @@ def _check_curvature_symmetries(R) -> None:
     ]:
         residual = float(np.abs(R - image).max())
         if residual > tolerance:
-            raise InputError(f"not a 4-bracket: {name} fails by {residual:.3g} (tolerance {tolerance:.1g})")
+            raise InputError(
+                f"the tensor R of a 4-bracket must obey {name}, but the sides differ by {residual:.3g} (tolerance "
+                f"{tolerance:.1g})"
+            )

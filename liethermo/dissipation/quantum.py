@@ -191,7 +191,7 @@ class ThermalJumps(Dissipation):
         return structure
 
     def replace_operators(self, matrices: Sequence[Any], bath: int) -> ThermalJumps:
-        """Return jumps with other matrices, such as those of a larger system, another bath and unchanged rates."""
+        """Return these jumps, with their rates, for other matrices and another bath, as in a larger system."""
         return replace_fields(self, operators=tuple(map(Operator, matrices)), bath=bath, jumps=())
 
     def force(self, system, x, dH, dS, dL):

@@ -165,7 +165,7 @@ def project_onto_levels(
         ), end_gradients
 
     def drop_allowed_monotone_residuals(s: ProjectionState) -> ProjectionState:
-        """Return the state without the residuals of functions that rise or fall, if they do so with the right sign."""
+        """Set the residual of each monotone function to zero if its change has the allowed sign; else aim at none."""
         actual_changes, rounding = (
             target_changes - s.level_residual,
             DIFFERENCE_NOISE * s.direction_lengths * jnp.linalg.norm(s.d),

@@ -33,7 +33,7 @@ class JointCoordinate(NamedTuple):
 
 
 class Hinge:
-    """A hinge: the body turns about one axis against its parent.
+    """A hinge: the body turns about one axis relative to its parent.
 
     Parameters
     ----------

@@ -208,7 +208,7 @@ def read_variables_and_attributes(path: str | os.PathLike) -> tuple[dict[str, np
     if attributes["format"] in FORMATS_WITHOUT_CHECKSUM:
         warn(f"{path} was written by an earlier version, without a checksum, so damage cannot be detected")
     elif attributes.get("sha256") != checksum(series, attributes):
-        raise FileError(f"{path} is damaged: its content does not have the checksum that it was written with")
+        raise FileError(f"{path} is damaged: its content does not match its stored checksum")
     return series, attributes
 
 

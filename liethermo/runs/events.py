@@ -176,7 +176,7 @@ def _n_zeros_to_end_run(event_function: Any, default_terminal: bool) -> int | No
 
 
 def _rate_below_tolerance_event(relaxation: Relaxed, system: System) -> tuple[str, RateAboveThreshold]:
-    """Return the name and the function of the event that the entropy production, or energy loss, falls below tol."""
+    """Return name and function of the event at which the rate of entropy production, or energy loss, is below tol."""
     if system.entropy_law == "nondecreasing":  # the laws say which rate vanishes as the system relaxes
         rate, name = "entropy_production", "entropy production"
     elif system.energy_law == "nonincreasing":

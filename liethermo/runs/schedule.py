@@ -420,7 +420,10 @@ def backward_span_message(start: float, end: float) -> str:
 
 
 def checked_span(span, allow_infinite_end: bool = False) -> tuple[float, float]:
-    """Return start and end of a span as floats; raise InputError unless they are finite and increasing."""
+    """Return start and end of a span as floats; raise InputError unless start < end and both are finite.
+
+    With ``allow_infinite_end`` the end may be infinite.
+    """
     try:
         start, end = (host_number(t, "t_span") for t in span)
     except (TypeError, ValueError):

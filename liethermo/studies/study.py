@@ -429,7 +429,7 @@ def _with_example_value(measure: Measure, value: np.ndarray) -> Measure:
 
 
 def _point_and_state_at(axes: Axes, index: tuple[int, ...]) -> tuple[dict[str, Any], np.ndarray | None]:
-    """Return the parameters of the point at an index, and its initial state, shape (1, n), or None without states."""
+    """Return the parameters of the point at an index, and its initial state, shape (1, n), None if no axis has any."""
     indices = tuple(np.array([i]) for i in index)
     return to_python_values({name: values[0] for name, values in axes.parameters_at(indices).items()}), axes.states_at(
         indices

@@ -237,7 +237,7 @@ class AttitudeSystem(LiftedSystem):
 
 
 def _body_block_slices(body: System) -> list[slice]:
-    """Return the slices of a state that hold the blocks of its body, with which the state begins."""
+    """Return the blocks of the body as slices of a state, which begins with the state of the body."""
     return [slice(*block.indices(body.dim)) for block in body.state_blocks]
 
 

@@ -280,7 +280,7 @@ def _resolve_reconstruction(algebra: mf.LieAlgebra, group, reconstruction: str |
 
 
 def _extends_algebra(group_algebra: mf.LieAlgebra, algebra: mf.LieAlgebra) -> bool:
-    """Return whether an algebra is that of a group, or its direct sum with an abelian algebra of internal parts."""
+    """Return whether ``algebra`` equals ``group_algebra``, or its direct sum with an abelian algebra."""
     n, n_internal = group_algebra.dim, algebra.dim - group_algebra.dim
     if n_internal < 0 or (n_internal > 0 and (len(algebra.shape) != 1 or algebra.dim > MAX_BODY_DIM)):
         return False

@@ -224,7 +224,10 @@ MAX_UNROLLED_OUTER_PRODUCTS = 9_000
 
 
 def _count_nonzero_products(rows: np.ndarray, columns: np.ndarray) -> int:
-    """Return the number of nonzero scalar products in a product of two matrices, the second given by its columns."""
+    """Return how many multiplications of a matrix product have no factor that is a constant zero.
+
+    The first matrix is given by its rows, the second by its columns.
+    """
     counts = [np.reshape([not _is_zero(a) for a in x.ravel().tolist()], x.shape).sum(axis=0) for x in (rows, columns)]
     return int(np.sum(counts[0] * counts[1]))
 

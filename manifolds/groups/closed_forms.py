@@ -206,7 +206,7 @@ def invertible_defect(g) -> jax.Array:
 
 
 def heisenberg_defect(g) -> jax.Array:
-    """Return the distance from I of the entries outside the first row and the last column."""
+    """Return the largest entry of ``|g - I|`` outside the coordinates ``g[0, 1:]`` and ``g[:-1, -1]``."""
     return max_abs_entry(jnp.where(_heisenberg_coordinate_mask(g), 0.0, g - np.eye(g.shape[-1])))
 
 

@@ -122,7 +122,10 @@ class GeomstatsSpace(Space):
         return float(self._evaluate_on_host("radius", np.asarray(x, dtype=float)[None])[0])
 
     def _random(self, key, size):
-        raise SpaceError(f"{self.name} draws its random points outside of compiled programs")
+        raise SpaceError(
+            f"{self.name} draws random points with NumPy, which compiled programs cannot do. Call its method random "
+            "outside of them"
+        )
 
     def _residual(self, x):
         return self._call_kernel("residual", x)

@@ -68,7 +68,10 @@ def ewald_kernel(lattice: Lattice, padded_cells: tuple[int, ...], splitting: flo
 
 
 def transform_axes(padded_cells: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the axes of a lattice that are longer than 1; a real transform halves the last of them."""
+    """Return the axes to transform: those with more than one cell, or the last axis if there are none.
+
+    Along the last of them a real transform stores half of the frequencies.
+    """
     return tuple(axis for axis, n in enumerate(padded_cells) if n > 1) or (len(padded_cells) - 1,)
 
 

@@ -56,9 +56,10 @@ def mesh(cells, size, periodic=False) -> Lattice:
 
 
 def continuum_exchange(cells: Lattice, stiffness) -> Energy:
-    """Return the exchange energy ``int A |grad m|^2`` of cells, without its constant: 0 minus ``2 A V / d^2`` a pair.
+    """Return the exchange energy ``int A |grad m|^2`` of a mesh, up to a constant.
 
-    At open borders the derivative of m along the normal is zero.
+    Neighbours i, j at a distance d contribute ``-(2 A V / d^2) m_i . m_j``. At open borders the derivative of m along
+    the normal is zero.
 
     Parameters
     ----------

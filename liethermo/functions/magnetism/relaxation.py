@@ -246,7 +246,7 @@ def hysteresis_loop(
     terms = energy_of_spins(energy, sites).terms
     values = np.asarray(check_finite(checked_numbers(fields, "fields"), "fields"))
     if values.ndim != 2 or values.shape[1] != 3 or not len(values):
-        raise InputError(f"fields must have shape (n, 3), got {values.shape}")
+        raise InputError(f"fields must have shape (n, 3) with n >= 1, got {values.shape}")
     _check_stopping_criteria(tolerance, max_steps)
     angle = checked_numbers(perturbation, "the perturbation", ())
     require_condition(

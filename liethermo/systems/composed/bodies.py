@@ -168,7 +168,7 @@ def _check_dim(dim) -> None:
 
 
 def _checked_friction(friction, dim: int, name: str):
-    """Return the friction of a body as a checked array, shape (n,) or (n, n), function, "contact" or None."""
+    """Check the friction of a body; return an array, shape (n,) or (n, n), a function, "contact" or None."""
     n = dim // 2
     if friction is None:
         return None
