@@ -35,7 +35,7 @@ def square_matrices(x, size: int, label: str) -> jax.Array:
     return array.astype(jnp.complex128 if complex_input else jnp.float64)
 
 
-def first_true_index(mask: np.ndarray) -> tuple[int, ...] | None:
+def first_true_multi_index(mask: np.ndarray) -> tuple[int, ...] | None:
     """Return the index of the first true entry, or None."""
     return tuple(int(i) for i in np.argwhere(mask)[0]) if mask.any() else None
 
@@ -107,4 +107,4 @@ def first_nonfinite_index(result, n_core_axes: int) -> tuple[int, ...] | None:
     """
     if is_traced(result):
         return None
-    return first_true_index(~np.isfinite(np.asarray(result)).all(axis=tuple(range(-n_core_axes, 0))))
+    return first_true_multi_index(~np.isfinite(np.asarray(result)).all(axis=tuple(range(-n_core_axes, 0))))

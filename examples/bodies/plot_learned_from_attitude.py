@@ -52,12 +52,14 @@ def with_numbers(logs):
 def missed(unknown):
     own, pi = with_numbers(unknown[:4]), unknown[4:] / jnp.linalg.norm(unknown[4:])
 
-    def transport(mu):
+    def angular_velocity(mu):
         x = jnp.append(mu, 0.0)
-        return own.transport(x, own.energy.gradient(x), own.entropy.gradient(x))
+        return own.attitude_velocity_from_gradients(
+            x, own.energy.gradient(x), own.entropy.gradient(x)
+        )
 
     return (
-        jax.vmap(transport)(jnp.einsum("tij,i->tj", turned[2:-2], pi)) - velocity
+        jax.vmap(angular_velocity)(jnp.einsum("tij,i->tj", turned[2:-2], pi)) - velocity
     ).ravel()
 
 

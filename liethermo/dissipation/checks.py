@@ -68,7 +68,7 @@ def checked_bath_indices(bath) -> Indices | None:
     return Indices(numbers)
 
 
-def reject_rate_as_form(form, dissipation: object, label: str) -> None:
+def reject_number_as_form(form, dissipation: object, label: str) -> None:
     """Raise InputError if a number is passed for a form: it is probably meant as a rate."""
     if isinstance(form, int | float):
         raise InputError(

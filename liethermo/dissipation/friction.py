@@ -26,7 +26,7 @@ from .checks import (
     checked_rate,
     checked_semidefinite,
     evaluate_form,
-    reject_rate_as_form,
+    reject_number_as_form,
     require_algebra,
 )
 from .factor import Factor
@@ -69,7 +69,7 @@ class Friction(Damping):
     rate: jax.Array = eqx.field(metadata=RATE_CONDITION.metadata)
 
     def __init__(self, D=None, rate=1.0, bath=None):
-        reject_rate_as_form(D, self, "the friction D")
+        reject_number_as_form(D, self, "the friction D")
         if D is not None and not callable(D):
             D = jnp.asarray(D) if is_traced(D) else D
             diagonal = jnp.diag if is_traced(D) else np.diag
@@ -154,7 +154,7 @@ class FrictionOperator(Dissipation):
     projection: str = eqx.field(static=True)
 
     def __init__(self, K, rate=1.0, project: bool = False, projection: Literal["oblique", "orthogonal"] = "oblique"):
-        reject_rate_as_form(K, self, "the operator K")
+        reject_number_as_form(K, self, "the operator K")
         self.K = K if callable(K) else checked_semidefinite(K, "the friction operator K")
         self.rate = checked_rate(rate)
         self.project = bool(project)

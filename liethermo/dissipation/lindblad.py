@@ -69,7 +69,7 @@ class LindbladJumps(Dissipation):
         pairs = list(couplings)
         if not pairs or not all(isinstance(pair, tuple | list) and len(pair) == 2 for pair in pairs):
             raise InputError("couplings must be a list of pairs (V, rate), such as [(V, 0.1)]")
-        self.operators = tuple(_checked_operator(V, f"the jump operator V[{i}]") for i, (V, _) in enumerate(pairs))
+        self.operators = tuple(_checked_jump_operator(V, f"the jump operator V[{i}]") for i, (V, _) in enumerate(pairs))
         self.rates = tuple(
             _rate_checked_at_start(rate, i) if callable(rate) else checked_rate(rate)
             for i, (_, rate) in enumerate(pairs)
@@ -193,7 +193,7 @@ class OperatorFunction(Module):
         return jnp.asarray(self.function(t), dtype=jnp.complex128)
 
 
-def _checked_operator(V: Any, label: str) -> Operator | OperatorFunction:
+def _checked_jump_operator(V: Any, label: str) -> Operator | OperatorFunction:
     """Return a jump operator as a matrix, or as a function of time, tested at t = 0."""
     if not callable(V) or isinstance(V, HasMatrix):
         return Operator(checked_square_matrix(V, label))

@@ -59,7 +59,7 @@ def terms_with_factors_at_state(dissipation: Dissipation, system: Geometry, x) -
     return noisy_terms_with_factors(dissipation, system, x, system.energy.gradient(x), dL)
 
 
-def factor_check_residuals(dissipation: Dissipation, system: Geometry, x) -> dict[str, jax.Array]:
+def factor_property_residuals(dissipation: Dissipation, system: Geometry, x) -> dict[str, jax.Array]:
     """Return the relative residuals at x, by name, of the properties that the factors must have."""
     dH = system.energy.gradient(x)
     (generic,) = generic_covectors(x.shape[0], 1)

@@ -25,7 +25,7 @@ from .checks import (
     checked_rates,
     checked_semidefinite,
     evaluate_form,
-    reject_rate_as_form,
+    reject_number_as_form,
 )
 from .factor import Factor
 from .geometry import isotropic_noise, isotropic_noise_dim, project_tangent
@@ -76,7 +76,7 @@ class ProjectedMetric(Dissipation):
     rate: jax.Array = eqx.field(metadata=RATE_CONDITION.metadata)
 
     def __init__(self, cometric=None, preserve=(), normalized=False, rate=1.0):
-        reject_rate_as_form(cometric, self, "the cometric")
+        reject_number_as_form(cometric, self, "the cometric")
         self.cometric = (
             cometric if cometric is None or callable(cometric) else checked_semidefinite(cometric, "the cometric")
         )

@@ -418,7 +418,7 @@ def _adjoint_products(jumps: tuple[Jump, ...]) -> np.ndarray:
 
 def _jump_gain(jumps: tuple[Jump, ...], rates, rho) -> jax.Array:
     """Return the gain term ``sum rate V rho V^H`` of Lindblad's equation, over the jumps and then their adjoints."""
-    table = _jump_gain_table(jumps)
+    table = _sparse_gain_terms(jumps)
     if table is None:
         matrices = _operators_and_adjoints(jumps)
         return jnp.sum((rates[:, None, None] * matrices) @ rho @ adjoint(matrices), axis=0)
@@ -427,7 +427,7 @@ def _jump_gain(jumps: tuple[Jump, ...], rates, rho) -> jax.Array:
 
 
 @functools.lru_cache(maxsize=64)
-def _jump_gain_table(jumps: tuple[Jump, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+def _sparse_gain_terms(jumps: tuple[Jump, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return, for each entry of ``sum V rho V^H``, the jump numbers, the entries of rho and the factors of its terms.
 
     None if products of matrices need fewer operations, as for a few full matrices.

@@ -333,7 +333,7 @@ def max_step_for_attitude(method: OneStepMethod, system: System, x, relative_err
 
     Explicit methods follow rotation angles, which are exact in a steady turn: they only need the angles to be small.
     """
-    rate = method.attitude_rate(system, x)
+    rate = method.attitude_speed_bound(system, x)
     allowed_angle = jnp.inf if method.explicit else max_step_times_rate(method, relative_error)
     angle = jnp.minimum(allowed_angle, MAX_ATTITUDE_ANGLE)
     return jnp.where(rate > 0.0, angle / jnp.where(rate > 0.0, rate, 1.0), jnp.inf)

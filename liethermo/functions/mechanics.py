@@ -246,7 +246,7 @@ class _PotentialOfVector(Module):
         return self.V(y[:-1], y[-1])
 
 
-def is_kinetic_plus_potential(energy: Energy, dim: int, space: mf.Space | None = None) -> bool:
+def is_mechanical_energy(energy: Energy, dim: int, space: mf.Space | None = None) -> bool:
     """Return whether each term of an energy is known to be ``p . G(q) p / 2``, with G semidefinite, or ``V(q, S)``.
 
     These are the energies of [SML 28]. On a space of positions, the symmetric part of ``P(q) G(q)`` must be

@@ -165,7 +165,7 @@ class OneStepMethod(Module):
         """Return an estimate of the local error of a step, in the units of x; adaptive steps need it."""
         raise InputError(f"{self} has no error estimate: {self.why_fixed_step}")
 
-    def attitude_rate(self, system: System, x) -> jax.Array:
+    def attitude_speed_bound(self, system: System, x) -> jax.Array:
         """Return the angular rate, rad / time, of the attitude that follows the steps; 0 if there is no attitude.
 
         :meth:`error` does not contain the error of the attitude, so this rate limits adaptive steps.
@@ -250,7 +250,7 @@ class TransportingMethod(OneStepMethod):
     """A method that gives the velocities with which it moves a body, so that an attitude can follow."""
 
     @abstractmethod
-    def can_transport_attitude(self, system: System) -> bool:
+    def follows_attitude_exactly(self, system: System) -> bool:
         """Return True if an attitude can follow the steps exactly, with the spatial momentum conserved to rounding.
 
         It can if the slopes at Gauss nodes are Pi times :meth:`attitude_velocities_at_stages`, or if the steps of an

@@ -167,7 +167,7 @@ class ExplicitMethod(TransportingMethod):
     def preserves_function(self, system: System, name: str) -> bool:
         return name in system.first_integrals()
 
-    def can_transport_attitude(self, system: System) -> bool:
+    def follows_attitude_exactly(self, system: System) -> bool:
         """Return True on coadjoint orbits of dimension 2 or less, where levels are orbits except for momenta at rest.
 
         Some larger orbits have fewer dimensions than the levels around them, for example on se(3) the orbit of a body

@@ -14,8 +14,8 @@ from manifolds._pytree_module import forward_to
 from ..dissipation.factor import Factor, concatenate_factors
 from ..dissipation.noise import (
     FACTOR_SQUARE_CHECK,
-    factor_check_residuals,
     factor_divergences,
+    factor_property_residuals,
     generic_covectors,
     noisy_terms_with_factors,
     terms_with_factors_at_state,
@@ -115,7 +115,7 @@ class StochasticMidpoint(MethodWrapper, TransportingMethod):
             start=system.attitude_velocity_from_gradients(z, dH, dS, dL),
         )[None]
 
-    def can_transport_attitude(self, system: System) -> bool:
+    def follows_attitude_exactly(self, system: System) -> bool:
         point = jnp.asarray(system.samples(1)[0])
         return all(
             B.added_attitude_velocity is not None
@@ -271,4 +271,4 @@ def _factor_residual_and_noise_changes(system: System, x):
             jnp.max(jnp.abs(B.transpose_times(gradient)), initial=0.0),
             max_product * jnp.linalg.norm(gradient),
         )
-    return factor_check_residuals(system.total_dissipation, system, x)[FACTOR_SQUARE_CHECK], changes
+    return factor_property_residuals(system.total_dissipation, system, x)[FACTOR_SQUARE_CHECK], changes

@@ -364,7 +364,7 @@ class MetriplecticGauss(GaussMethod, TransportingMethod):
             else functions
         )
 
-    def can_transport_attitude(self, system: System) -> bool:
+    def follows_attitude_exactly(self, system: System) -> bool:
         """Return whether the steps determine the attitude exactly: they do if nothing is projected off the slopes."""
         names = preserved_function_names(system)
         terms = terms_with_preserved_values(system.total_dissipation.terms, names)

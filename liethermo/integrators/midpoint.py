@@ -87,7 +87,7 @@ class MetriplecticMidpoint(TransportingMethod):
             None
         ]
 
-    def can_transport_attitude(self, system: System) -> bool:
+    def follows_attitude_exactly(self, system: System) -> bool:
         return True
 
     def residual_jvp(self, system: System, x, compensation, h, k) -> Callable:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from manifolds._pytree_module import replace_fields
 from manifolds.groups.maps import central_part, components_from_ad_cayley, inverse_dexp
-from manifolds.matrices.linear import solve_near_identity
+from manifolds.matrices.linear import solve_without_pivoting
 
 from ..errors import InputError
 from ..functions.frames import vector_with_inner_products
@@ -87,7 +87,7 @@ class WithAttitude(MethodWrapper):
         if name not in (SPATIAL_MOMENTUM, MOMENTUM_LESS_IMPULSE):
             return self.method.preserves_function(system.body, name)
         follows = self.kind == "coadjoint" or (self.kind == "cayley" and system.group.cayley_is_adjoint())
-        return (self.explicit or follows) and self._checked_inner_method.can_transport_attitude(system.body)
+        return (self.explicit or follows) and self._checked_inner_method.follows_attitude_exactly(system.body)
 
     def check(self, system) -> None:
         self.method.check(system.body.bind_attitude(system.group.identity))
@@ -134,7 +134,7 @@ class WithAttitude(MethodWrapper):
             system.body_states(k),
         )
 
-    def attitude_rate(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
+    def attitude_speed_bound(self, system: AttitudeSystem, x) -> jax.Array:  # type: ignore[override]
         """Return a bound of the moduli of the eigenvalues of ad(xi): for SO(3) 1.2 times the angular velocity."""
         generator = system.group.algebra.ad(system.attitude_velocity(x))
         return jnp.sqrt(jnp.sqrt(jnp.sum((generator @ generator) ** 2)))
@@ -191,7 +191,7 @@ class WithAttitude(MethodWrapper):
         new_g = g @ group.exp_map(group.algebra, local.rotation_angles(step))
         keeps_orbit, p_compensation = (
             dissipation_keeps_spatial_momentum(system.body)
-            and self._checked_inner_method.can_transport_attitude(system.body),
+            and self._checked_inner_method.follows_attitude_exactly(system.body),
             None,
         )
         if system.impulse_dim:
@@ -222,7 +222,7 @@ class WithAttitude(MethodWrapper):
     def _attitude_increment(self, group, stage_angles) -> jax.Array:
         """Return the group element that rotates the attitude, for angles h xi at the stages, shape (stages, dim)."""
         if self.kind == "coadjoint":
-            return self._coadjoint_increment(group, stage_angles)
+            return self._group_increment(group, stage_angles)
         return group.exp_map(
             group.algebra, gauss_tableau(len(stage_angles)).b @ self._munthe_kaas_slopes(group.algebra, stage_angles)
         )
@@ -286,7 +286,7 @@ class WithAttitude(MethodWrapper):
         return layout.join_state(mu + system.body_states(v), g, layout.impulse(x))
 
     @staticmethod
-    def _coadjoint_increment(group, stage_angles) -> jax.Array:
+    def _group_increment(group, stage_angles) -> jax.Array:
         """Return the group element whose adjoint action is that of the step, for angles h xi, shape (stages, dim).
 
         If the end of the collocation is no adjoint action, the nearest one is used, to the order of the method.
@@ -341,7 +341,7 @@ def _collocation_stages(stage_generators) -> jax.Array:
     X_transposed = stage_generators.swapaxes(-1, -2)
     implicit = jnp.einsum("ij,jab->iajb", tableau.A, X_transposed).reshape(stages * m, stages * m)
     start = jnp.tile(jnp.eye(m), (stages, 1))
-    G = solve_near_identity(jnp.eye(stages * m) - implicit, start).reshape(stages, m, m)
+    G = solve_without_pivoting(jnp.eye(stages * m) - implicit, start).reshape(stages, m, m)
     return G.swapaxes(-1, -2)
 
 
@@ -401,7 +401,9 @@ def _align_attitude(group, g, spatial_momentum, body_momentum) -> jax.Array:
         damping = jnp.where(
             max_diagonal > 0.0, NEWTON_DAMPING * max_diagonal, 1.0
         )  # what moves m by rounding alone does not turn either
-        eta = solve_near_identity(square + damping * jnp.eye(algebra.dim), (orbit_tangents @ residual)[:, None])[:, 0]
+        eta = solve_without_pivoting(square + damping * jnp.eye(algebra.dim), (orbit_tangents @ residual)[:, None])[
+            :, 0
+        ]
         g = g @ group.exp_map(algebra, eta)
         if iteration == MAX_NEWTON_ITERATIONS:
             return g

@@ -12,7 +12,7 @@ from ..errors import InputError
 from ..results.solution import Solution
 from ..systems import System
 from .observation import Observation
-from .records import Records, Trajectory, is_table, read_data
+from .records import Records, Trajectory, is_readable_table, read_data
 
 SPLINE_DEGREE = 5
 """Degree of the splines through the data, whose derivatives are then of order 5."""
@@ -35,7 +35,7 @@ def parse_trajectories(data: Any, system: System, observation: Observation) -> l
     return trajectories
 
 
-def _select_observed_columns(records: Records, observation: Observation) -> list[Trajectory]:
+def _observed_trajectories(records: Records, observation: Observation) -> list[Trajectory]:
     """Return the trajectories of a table with the observed columns only: by name, or all if the observation has no
     names.
 
@@ -62,10 +62,10 @@ def _time_observation_pairs(data: Any, observation: Observation) -> list[tuple[A
     InputError
         If data are not pairs, solutions, a table, or a sequence of these.
     """
-    if is_table(data):
+    if is_readable_table(data):
         data = read_data(data, columns=observation.names or None)
     if isinstance(data, Records):
-        return list(_select_observed_columns(data, observation))
+        return list(_observed_trajectories(data, observation))
     if isinstance(data, Solution):
         return [(data.t, observation.observe_solution(data))]
     if isinstance(data, tuple) and len(data) == 2 and _ndim_or_none(data[0]) == 1:

@@ -211,7 +211,9 @@ def fit(
     observation = make_observation(model, observed, observe, values)
     method = MetriplecticRungeKutta(4) if method is None else method
     n_substeps = 1 if substeps is None else substeps
-    prepared_system = losses.differentiable_stepper(model, method, n_substeps, observation.group is not None).system
+    prepared_system = losses.prepare_differentiable_stepper(
+        model, method, n_substeps, observation.group is not None
+    ).system
     trajectories = [trajectory.flat_trajectory for trajectory in parse_trajectories(data, model, observation)]
     data_scale = compute_data_scales(trajectories)
     sigma = checked_noise_std(noise, data_scale.scale.size)

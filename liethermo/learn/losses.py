@@ -169,7 +169,7 @@ def shooting_objective(
     def loss(vector, arrays, indices):
         initial_guess, intervals, observations, times, next_window = arrays
         system, values = params.build_system(vector[:p]), params.parameters_of(vector[:p])
-        prepared_system, init, advance, get_state = differentiable_stepper(
+        prepared_system, init, advance, get_state = prepare_differentiable_stepper(
             system, method, substeps, observation.group is not None
         )
 
@@ -234,7 +234,7 @@ class DifferentiableStepper(NamedTuple):
     get_state: Callable
 
 
-def differentiable_stepper(
+def prepare_differentiable_stepper(
     system: System, method: OneStepMethod, substeps: int | jax.Array, has_attitude: bool = False
 ) -> DifferentiableStepper:
     """Prepare a system for differentiable runs; return it with functions that start, advance and read a run.

@@ -416,10 +416,10 @@ class Metriplectic(MetriplecticSystem):
             friction = Friction(dim, rank, width=width, depth=depth, seed=4 * seed + 3)
         has_learned_tensor = isinstance(poisson, Poisson)  # but for the Jacobi identity
         super().__init__(poisson, energy, entropy, friction, dim=dim, validate=validate and not has_learned_tensor)
-        self.poisson = set_poisson_entropy(self.poisson, self.entropy)
+        self.poisson = fill_learned_poisson_entropy(self.poisson, self.entropy)
 
 
-def set_poisson_entropy(poisson: mf.PoissonStructure, entropy: AnyEnergy | None) -> mf.PoissonStructure:
+def fill_learned_poisson_entropy(poisson: mf.PoissonStructure, entropy: AnyEnergy | None) -> mf.PoissonStructure:
     """Return a Poisson structure with the entropy of its system stored in it, if it is a learned one that needs it."""
     if not isinstance(poisson, Poisson) or poisson.entropy is None:
         return poisson
@@ -428,7 +428,7 @@ def set_poisson_entropy(poisson: mf.PoissonStructure, entropy: AnyEnergy | None)
 
 def copy_entropy_to_poisson(system: T) -> T:
     """Return the system with the current weights of its entropy copied to its Poisson structure."""
-    return eqx.tree_at(lambda s: s.poisson, system, set_poisson_entropy(system.poisson, system.entropy))
+    return eqx.tree_at(lambda s: s.poisson, system, fill_learned_poisson_entropy(system.poisson, system.entropy))
 
 
 def scale_networks(system: T, data_scales: DataScales, states: np.ndarray) -> T:

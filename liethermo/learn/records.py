@@ -155,7 +155,7 @@ def read_data(
         raise InputError(
             f"units has {unread_names[0]!r}, but this column is not read. Remove it, or add it to columns="
         )
-    t = _time_column(table[time_label], labels, time_label)
+    t = _times_in_seconds(table[time_label], labels, time_label)
     x = np.stack([_value_column(table[label], labels, label) for label in value_labels], axis=1)
     groups = np.zeros(len(t)) if group_label is None else np.asarray(table[group_label])
     names = tuple(labels.names[label] for label in value_labels)
@@ -167,7 +167,7 @@ def read_data(
     return Records(names, tuple(trajectories))
 
 
-def is_table(data: Any) -> bool:
+def is_readable_table(data: Any) -> bool:
     """Return True if data are a table with names, which :func:`read_data` reads."""
     return (
         isinstance(data, str | os.PathLike | Mapping)
@@ -249,7 +249,7 @@ class _Labels:
             raise InputError(f"column {label!r}: {error}. Set it with units={{{name!r}: ...}}, '' for none") from None
 
 
-def _time_column(values: np.ndarray, labels: _Labels, label: str) -> np.ndarray:
+def _times_in_seconds(values: np.ndarray, labels: _Labels, label: str) -> np.ndarray:
     """Convert a column of times to seconds; dates count from the first one.
 
     Raises

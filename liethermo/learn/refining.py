@@ -10,7 +10,7 @@ import numpy as np
 
 from ..integrators import OneStepMethod
 from .data import Trajectory
-from .losses import ParameterVector, differentiable_stepper
+from .losses import ParameterVector, prepare_differentiable_stepper
 from .observation import Observation, fast_compile_options, n_displacement_coordinates
 from .parts import Perceptron
 
@@ -204,7 +204,7 @@ class RunModel:
 
     def _differentiable_stepper(self, weights, substeps):
         has_attitude = self.observation.group is not None
-        return differentiable_stepper(self.params.build_system(weights), self.method, substeps, has_attitude)
+        return prepare_differentiable_stepper(self.params.build_system(weights), self.method, substeps, has_attitude)
 
     def displace(self, states: np.ndarray, displacements: np.ndarray) -> np.ndarray:
         """Return states displaced by tangent coordinates, both with one row for each state."""

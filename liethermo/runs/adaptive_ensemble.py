@@ -39,7 +39,7 @@ class AdaptiveEnsembleRun(EnsembleRun):
         schedule = self.group.schedule
         return schedule.start, float(schedule.stop_times[0]), schedule.end - schedule.start
 
-    def _run_in_compiled_lanes(self, lanes: CompiledLanes, members: slice, stop_signal: threading.Event) -> None:
+    def _record_compiled_lanes(self, lanes: CompiledLanes, members: slice, stop_signal: threading.Event) -> None:
         parameters, x0 = lanes.parameters_of_members(members, members.stop - members.start), self.group.x0[members]
         adaptive_runs = CompiledAdaptiveRuns(
             lanes.step_loop, lanes.first_lane_parameters, parameters, x0, *self._start_first_stop_and_span_length

@@ -57,7 +57,7 @@ MIN_STEPS_FOR_THREADS = 20_000
 """Number of steps, summed over trajectories, below which starting threads takes longer than the steps."""
 
 
-def run_in_threads(
+def run_slices_in_threads(
     run_members: Callable[[slice, threading.Event], None], n_trajectories: int, max_steps_each: float = math.inf
 ) -> None:
     """Call ``run_members(members, stop_signal)`` for slices of the trajectories, in one thread per core.
@@ -125,7 +125,7 @@ class EnsembleRun(abc.ABC):
         group = self.group
         lanes = CompiledLanes(group.family, group.method, group.control)
         max_steps = group.schedule.n_steps if group.control is None else math.inf
-        run_in_threads(functools.partial(self._run_in_compiled_lanes, lanes), len(group.x0), max_steps)
+        run_slices_in_threads(functools.partial(self._record_compiled_lanes, lanes), len(group.x0), max_steps)
 
     def run_on_array_engine(self) -> None:
         """Run all trajectories on the array engine, one vmapped program per batch."""
@@ -137,7 +137,7 @@ class EnsembleRun(abc.ABC):
                 return
 
     @abc.abstractmethod
-    def _run_in_compiled_lanes(self, lanes: CompiledLanes, members: slice, stop_signal: threading.Event) -> None:
+    def _record_compiled_lanes(self, lanes: CompiledLanes, members: slice, stop_signal: threading.Event) -> None:
         """Run a slice of the trajectories in SIMD lanes, until ``stop_signal`` is set."""
 
     @abc.abstractmethod
@@ -151,7 +151,7 @@ class EnsembleRun(abc.ABC):
 class FixedEnsembleRun(EnsembleRun):
     """Run of a group of trajectories of an ensemble with fixed steps."""
 
-    def _run_in_compiled_lanes(self, lanes: CompiledLanes, members: slice, stop_signal: threading.Event) -> None:
+    def _record_compiled_lanes(self, lanes: CompiledLanes, members: slice, stop_signal: threading.Event) -> None:
         n_members = members.stop - members.start
         if not stop_signal.is_set():
             # NumPy releases the interpreter's lock in every operation; switching threads takes longer than these

@@ -90,7 +90,7 @@ class EngineReplay:
 
     engine: EngineWithFallback
 
-    def displacements_after_steps(
+    def replay_displacements_and_success(
         self, trajectory_indices: np.ndarray, initial_states: np.ndarray, step_sizes: np.ndarray, n_steps: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the displacements after ``n_steps`` steps of size step_sizes[i] from each state initial_states[i].
@@ -149,7 +149,7 @@ class LaneReplay:
     family: Family
     method: OneStepMethod
 
-    def displacements_after_steps(
+    def replay_displacements_and_success(
         self, trajectory_indices: np.ndarray, initial_states: np.ndarray, step_sizes: np.ndarray, n_steps: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the displacements after ``n_steps`` steps, and whether all steps succeeded: see
@@ -239,7 +239,7 @@ class StepChecker:
                 replayed_steps = replayed_steps._replace(
                     field_rounding_floor=np.fmax(replayed_steps.field_rounding_floor, field_rounding(steps))
                 )
-            relative_displacement = self._relative_displacements(replayed_steps)
+            relative_displacement = self._displacements_per_state_size(replayed_steps)
             moving_indices = np.flatnonzero(replayed_steps.is_completed & (relative_displacement > MIN_RELATIVE_MOTION))
             if not moving_indices.size:
                 return evidence
@@ -359,7 +359,7 @@ class StepChecker:
             _divide_unless_zero(self._maximum_over_each_block(np.abs(slope - mean_field)), scales), axis=1
         )
 
-    def _relative_displacements(self, replayed_steps: ReplayedSteps) -> np.ndarray:
+    def _displacements_per_state_size(self, replayed_steps: ReplayedSteps) -> np.ndarray:
         """Return the displacements of steps relative to the state, shape (m,), the largest over its blocks.
 
         A block that starts at zero is measured relative to its norm at the end of the step.
@@ -378,7 +378,7 @@ class StepChecker:
         self, steps: StepSample, field_rounding_floor: np.ndarray, n_substeps: int = 1
     ) -> ReplayedSteps:
         """Take steps once more, each in ``n_substeps`` equal substeps."""
-        displacement, is_completed = self.replay.displacements_after_steps(
+        displacement, is_completed = self.replay.replay_displacements_and_success(
             steps.trajectory, steps.x, steps.h / n_substeps, n_substeps
         )
         return ReplayedSteps(

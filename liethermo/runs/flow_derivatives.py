@@ -71,7 +71,7 @@ def _nest_vmaps(function: Callable, vmap_axes: Sequence[tuple]) -> Callable:
     return function
 
 
-def _abstract_solution(*arguments, vmap_axes: tuple, **_):
+def _solution_shape_dtype(*arguments, vmap_axes: tuple, **_):
     """Return shape and type of the solution: the axes of all enclosing ``vmap``, then those of the guess."""
     shape, guess = arguments[-1].shape, arguments[-1]
     sizes = []
@@ -131,7 +131,7 @@ def _jvp_rule(primals, tangents, *, residual: Callable, structure, vmap_axes: tu
 
 
 _implicit_solution.def_impl(lambda *arguments, **rest: jax.jit(lambda *a: _run_solver(*a, **rest))(*arguments))
-_implicit_solution.def_abstract_eval(_abstract_solution)
+_implicit_solution.def_abstract_eval(_solution_shape_dtype)
 batching.primitive_batchers[_implicit_solution] = _batching_rule
 ad.primitive_jvps[_implicit_solution] = _jvp_rule
 mlir.register_lowering(_implicit_solution, mlir.lower_fun(_run_solver, multiple_results=False))
@@ -162,7 +162,7 @@ class _StepFunction(eqx.Module):
     slopes_shape: tuple[int, int] = eqx.field(static=True)
     order: int = eqx.field(static=True)
 
-    def unpack_row(self, z) -> tuple[Any, Any, jax.Array, jax.Array]:
+    def unpack_method_state_slopes(self, z) -> tuple[Any, Any, jax.Array, jax.Array]:
         """Return system, method, state and slopes from z, shape (n + q + m,): state, parameters and slopes."""
         leaves, structure = jax.tree_util.tree_flatten(self.system_method_state)
         *other_leaves, x = leaves
@@ -180,7 +180,7 @@ class _StepFunction(eqx.Module):
 
     def __call__(self, h, compensation, z) -> jax.Array:
         """Return the residual of the stage equations, followed by the next state."""
-        system, method, x, k = self.unpack_row(z)
+        system, method, x, k = self.unpack_method_state_slopes(z)
         residual = method.slopes(system, x, compensation, h, k) - k
         return jnp.concatenate([residual.ravel(), method.move(system, x, compensation, h, k)[0]])
 

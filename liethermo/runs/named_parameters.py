@@ -97,7 +97,7 @@ def replace_parameters(system: System, parameter_values: Mapping[str, Any]) -> S
         array = host_array(checked_numbers(value, name))
         if array.shape != parameter.value.shape:
             raise InputError(f"{name} must have shape {parameter.value.shape}, got {array.shape}")
-        _record_name_of_leaves(names_by_leaf, name, parameter)
+        _claim_leaves(names_by_leaf, name, parameter)
         if parameter.condition is not None:
             parameter.condition.require(array)
         for i in parameter.leaf_indices:
@@ -158,7 +158,7 @@ def stack_member_arrays(system: System, member_values: Mapping[str, Any]) -> lis
         if array.ndim == 0 or array.shape[1:] != parameter.value.shape:
             expected_shape = ", ".join(["trajectories", *map(str, parameter.value.shape)])
             raise InputError(f"the values of {name} must have shape ({expected_shape}), got {array.shape}")
-        _record_name_of_leaves(names_by_leaf, name, parameter)
+        _claim_leaves(names_by_leaf, name, parameter)
         for i in parameter.leaf_indices:
             leaves[i] = np.asarray(parameter.to_stored_array(array))
     return leaves
@@ -188,7 +188,7 @@ def find_parameter_or_none(system: System, name: str) -> NamedParameter | None:
     return parameters_by_name.get(name) or parameters_by_path.get(name)
 
 
-def _record_name_of_leaves(names_by_leaf: dict[int, str], name: str, parameter: NamedParameter) -> None:
+def _claim_leaves(names_by_leaf: dict[int, str], name: str, parameter: NamedParameter) -> None:
     """Record the name under which the user gave a parameter; raise InputError if another name gave it before."""
     for i in parameter.leaf_indices:
         if i in names_by_leaf:
@@ -202,7 +202,7 @@ def _parameters_by_name_and_by_path(system: System) -> tuple[dict[str, NamedPara
     paths_and_leaves, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(system, eqx.is_inexact_array))
     fields = [[jax.tree_util.keystr((key,)).removeprefix(".") for key in path] for path, _ in paths_and_leaves]
     paths = [jax.tree_util.keystr(path).removeprefix(".") for path, _ in paths_and_leaves]
-    arrays, has_derived_energy = parameter_arrays(system), _has_derived_energy(fields)
+    arrays, has_derived_energy = parameter_arrays(system), _is_energy_from_lagrangian(fields)
     conditions = [_condition_at_path(system, path) for path, _ in paths_and_leaves]
     leaves_by_name: dict[str, list[int]] = {}
     for i, path_fields in enumerate(fields):
@@ -226,7 +226,7 @@ def _parameters_by_name_and_by_path(system: System) -> tuple[dict[str, NamedPara
     return _replace_energy_matrix_by_inertia(system, parameters_by_name, parameters_by_path), parameters_by_path
 
 
-def _has_derived_energy(field_paths: list[list[str]]) -> bool:
+def _is_energy_from_lagrangian(field_paths: list[list[str]]) -> bool:
     """Return whether the energy was computed from the Lagrangian of a system, so that neither can be set alone."""
     has_lagrangian = any(path[0] == "lagrangian" for path in field_paths)
     return has_lagrangian and not any(path[0] == "energy" and "lagrangian" in path for path in field_paths)

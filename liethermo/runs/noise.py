@@ -15,7 +15,7 @@ import scipy
 from manifolds._class_members import ListedType
 
 from ..dissipation.geometry import divergence_summands_of_fields
-from ..dissipation.noise import factor_check_residuals
+from ..dissipation.noise import factor_property_residuals
 from ..errors import InputError
 from ..functions.conditions import host_number
 from ..functions.energy import Energy, make_energy
@@ -329,7 +329,7 @@ def _noise_and_measure_residuals(model: tuple[System, Energy | None], x):
         terms = jnp.append(terms, jnp.dot(density.gradient(x), motion(x)))
     scale = jnp.max(jnp.abs(terms)) + jnp.max(jnp.abs(motion(x))) / (1.0 + jnp.max(jnp.abs(x)))
     measure_residual = {MEASURE_ROW: jnp.abs(jnp.sum(terms)) / jnp.where(scale > 0.0, scale, 1.0)}
-    return factor_check_residuals(system.total_dissipation, system, x) | measure_residual
+    return factor_property_residuals(system.total_dissipation, system, x) | measure_residual
 
 
 @dataclass(frozen=True)

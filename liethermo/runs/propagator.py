@@ -44,8 +44,8 @@ from .schedule import (
     CHUNK_STEPS,
     ScheduleSegment,
     StepSchedule,
+    checked_resolvable_step,
     checked_span,
-    checked_step,
     checked_step_size,
     make_schedule,
 )
@@ -341,7 +341,7 @@ class Propagator(metaclass=ListedType):
         ):
             return None
         start, end = checked_span(t_span)
-        h = checked_step(self.step, start, end)
+        h = checked_resolvable_step(self.step, start, end)
         segment = ScheduleSegment.from_span(start, end, h)
         if segment.n_full_steps > CHUNK_STEPS:
             return None  # a run in portions, which Ctrl-C can stop

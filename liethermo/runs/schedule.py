@@ -125,7 +125,7 @@ class StepSchedule:
         breaks: Sequence[float] = (),
     ):
         self.start, self.end = checked_span(span, allow_infinite_end)
-        self.h = math.inf if math.isinf(self.end) else checked_step(step, self.start, self.end)
+        self.h = math.inf if math.isinf(self.end) else checked_resolvable_step(step, self.start, self.end)
         if save_every is not None and (
             isinstance(save_every, bool) or not isinstance(save_every, int) or save_every < 1
         ):
@@ -322,7 +322,7 @@ def make_schedule(
     """
     start, end = checked_span(span, allow_infinite_end)
     refuse_span_beyond_known_times(start, end, declared_times.known_span)
-    step_size = end - start if isinstance(step, Adaptive) else checked_step(step, start, end)
+    step_size = end - start if isinstance(step, Adaptive) else checked_resolvable_step(step, start, end)
     kinks = [t for t in declared_times.kinks if start < t < end]
     if not isinstance(step, Adaptive) and (save_every not in (None, 1) or len(kinks) * step_size > end - start):
         kinks = []
@@ -447,7 +447,7 @@ def checked_step_size(step) -> float:
     return h
 
 
-def checked_step(step, start: float, end: float) -> float:
+def checked_resolvable_step(step, start: float, end: float) -> float:
     """Return the step size as a float; raise InputError unless it is positive and above the rounding of the times."""
     h = checked_step_size(step)
     if start + h == start or end + h == end:

@@ -80,7 +80,7 @@ class VariedParameters:
         ends = np.cumsum([leaf.size for leaf in self._leaves])
         self.indices = np.concatenate([np.arange(ends[i] - self._leaves[i].size, ends[i]) for i in self._varied_leaves])
         self.entries = np.concatenate([self._leaves[i].ravel() for i in self._varied_leaves])
-        slots = iter(self._split_by_leaf(self.entries))
+        slots = iter(self._unflatten_varied_arrays(self.entries))
         self._slots = [(parameter, [next(slots) for _ in parameter.leaf_indices]) for parameter in parameters]
         self._functions = tuple(
             name for name in candidate_invariants(system) if name not in invariants_by_construction(system)
@@ -146,11 +146,11 @@ class VariedParameters:
     def _system_with_entries(self, entries) -> System:
         """Return the system with these entries, shape (p,), of the varied parameters."""
         leaves: list[Any] = [jnp.asarray(leaf) for leaf in self._leaves]
-        for i, leaf in zip(self._varied_leaves, self._split_by_leaf(entries), strict=True):
+        for i, leaf in zip(self._varied_leaves, self._unflatten_varied_arrays(entries), strict=True):
             leaves[i] = leaf
         return self._structure.rebuild(leaves)
 
-    def _split_by_leaf(self, entries) -> list[Any]:
+    def _unflatten_varied_arrays(self, entries) -> list[Any]:
         """Return the entries, shape (p,), as a list with one array for each varied array of the system."""
         shapes = [self._leaves[i].shape for i in self._varied_leaves]
         ends = np.cumsum([self._leaves[i].size for i in self._varied_leaves]).tolist()

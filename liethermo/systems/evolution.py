@@ -16,7 +16,7 @@ from ..dissipation.base import SkewFriction, nondecreasing_law_if
 from ..errors import InputError
 from ..functions.checks import checked_energy, with_polynomial_degrees
 from ..functions.energy import Energy, Quadratic, make_energy
-from ..functions.mechanics import is_kinetic_plus_potential
+from ..functions.mechanics import is_mechanical_energy
 from ..functions.time_span import required_argument_count
 from .base import System
 from .embedded import EmbeddedSystem
@@ -60,7 +60,7 @@ class ContactManifoldSystem(System):
         entropy: Energy | None = None
         friction: LiouvilleFriction = ReebDrift()
         if self.is_isolated:
-            law = nondecreasing_law_if(is_kinetic_plus_potential(mechanics, dim, space))
+            law = nondecreasing_law_if(is_mechanical_energy(mechanics, dim, space))
             entropy, friction = entropy_component(dim), LiouvilleFriction(law=law)
         arguments = structure, dim, energy, entropy, friction, momentum_maps, validate
         self._build(*arguments, state_space(space), check_poisson=space is None)

@@ -23,7 +23,7 @@ from .caching import LRUCache, memoize, pytree_key_or_none
 from .index_check import check_indices
 from .programs import jit_unoptimised
 from .scalarize import UnsupportedPrimitive, scalarize
-from .searches import count_dense_operations
+from .searches import count_scalar_operations
 from .traced import has_plain_functions_or_floats, is_library_object, trace_callables
 
 DEGREE_PRESERVING = frozenset(
@@ -143,7 +143,7 @@ def make_batch_evaluator(function: Callable, pytree: Any, dim: int) -> Callable[
         )
         if not is_library_object(pytree):
             check_indices(closed_jaxpr)
-        if count_dense_operations(closed_jaxpr.jaxpr) > MAX_DENSE_OPERATIONS:
+        if count_scalar_operations(closed_jaxpr.jaxpr) > MAX_DENSE_OPERATIONS:
             raise UnsupportedPrimitive(function.__name__, "", "within the size limit", too_large=True)
         zeros = [np.where(value == 0.0, 0.0, np.nan) for value in values]
         return scalarize(

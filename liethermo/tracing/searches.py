@@ -54,7 +54,7 @@ def has_while_loop(jaxpr: Jaxpr) -> bool:
     return any(equation.primitive.name == "while" for equation, _ in iterate_equations(jaxpr))
 
 
-def count_dense_operations(jaxpr: Jaxpr) -> int:
+def count_scalar_operations(jaxpr: Jaxpr) -> int:
     """Return the number of scalar operations of a jaxpr, operations on zeros included.
 
     One pass of a loop of unknown length is counted.

@@ -225,7 +225,7 @@ class _Recurrences:
             ):
                 results = _evaluate_equation(eqn, map(self.initial_value, arguments))  # tests use the initial values
             else:
-                results = SERIES_RULES.get(name, _unsupported_primitive_rule)(self, eqn, arguments)
+                results = SERIES_RULES.get(name, _placeholder_rule)(self, eqn, arguments)
             env.update(zip(eqn.outvars, results, strict=True))
         return [read(v) for v in jaxpr.outvars]
 
@@ -233,7 +233,7 @@ class _Recurrences:
 # -- rules: rule(recurrences, equation, values) -> list of results ----------------------------------------------------
 
 
-def _unsupported_primitive_rule(recurrences: _Recurrences, eqn, values) -> list:
+def _placeholder_rule(recurrences: _Recurrences, eqn, values) -> list:
     """Return placeholder terms without a recurrence, which only tests may read; other uses raise TaylorSeriesError."""
     return [
         recurrences.add_term(start, None, refusal=(eqn.primitive.name, user_source_line(eqn)))
@@ -335,7 +335,7 @@ def _linear_solve_rule(recurrences: _Recurrences, eqn, values) -> list:
     lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
     constants, right_sides = list(values[: sum(lengths)]), values[sum(lengths) :]
     if len(right_sides) > 1:
-        return _unsupported_primitive_rule(recurrences, eqn, values)
+        return _placeholder_rule(recurrences, eqn, values)
     (b,), starts = right_sides, [recurrences.initial_value(value) for value in constants]
     shape = np.shape(recurrences.initial_value(b))
     basis = np.eye(int(np.prod(shape)))

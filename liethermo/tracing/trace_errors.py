@@ -74,7 +74,7 @@ def _user_line_in_parentheses(error: BaseException) -> str:
     return ""
 
 
-def check_not_none(value, name: str) -> None:
+def check_returned_value(value, name: str) -> None:
     """Raise FunctionError if a function returned None."""
     if value is None:
         raise FunctionError(f"{name} returns None. Add the missing `return`")

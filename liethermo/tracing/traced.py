@@ -28,7 +28,7 @@ from ..errors import FunctionError
 from .index_check import check_indices
 from .lifting import ConstantLifter
 from .short_form import callable_name
-from .trace_errors import check_not_none, check_precision
+from .trace_errors import check_precision, check_returned_value
 
 
 class TracedProgram:
@@ -181,7 +181,7 @@ def trace_function(function: Callable, *arguments) -> TracedFunction:
 
     def evaluate(*values):  # a new function object: JAX caches traces by it, and globals that it reads may change
         result = function(*values)
-        check_not_none(result, name)
+        check_returned_value(result, name)
         return result
 
     with contextlib.nullcontext() if is_library_code else user_settings():

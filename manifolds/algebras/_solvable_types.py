@@ -66,7 +66,7 @@ def jordan_blocks(matrix: np.ndarray) -> list[JordanBlock]:
     if scale == 0.0:
         return [JordanBlock(0.0, 1)] * n
     blocks = []
-    for eigenvalue, multiplicity in distinct_eigenvalues(matrix):
+    for eigenvalue, multiplicity in upper_eigenvalues_and_multiplicities(matrix):
         shifted_matrix = values / scale - eigenvalue / scale * np.eye(n)
         power, ranks = np.eye(n, dtype=complex), [n]
         for _ in range(multiplicity + 1):
@@ -82,7 +82,7 @@ def jordan_blocks(matrix: np.ndarray) -> list[JordanBlock]:
     return sorted(blocks, key=lambda block: -block.size)
 
 
-def distinct_eigenvalues(matrix: np.ndarray) -> list[tuple[complex, int]]:
+def upper_eigenvalues_and_multiplicities(matrix: np.ndarray) -> list[tuple[complex, int]]:
     """Return the distinct eigenvalues of a real matrix with nonnegative imaginary part, and their multiplicities."""
     if is_exact(matrix):
         groups = []

@@ -17,7 +17,7 @@ AXIOM_TOLERANCE = 1e-12
 """Largest relative residual of an axiom for constants that are not rational (rounding of a few products)."""
 
 
-def checked_constants(values) -> np.ndarray:
+def finite_cubic_array(values) -> np.ndarray:
     """Return structure constants as an array, after checking that it is cubic, real and finite."""
     try:
         array = np.asarray(values)
@@ -193,7 +193,7 @@ def balance_constants(constants: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             break
         mask = new_mask  # constants that stand out from rounding only after scaling take part from then on
         logarithms = np.log(magnitudes, where=mask, out=np.zeros(magnitudes.shape))
-        x, *_ = np.linalg.lstsq(_balance_normal_matrix(mask), -_balance_right_hand_side(logarithms), rcond=1e-10)
+        x, *_ = np.linalg.lstsq(_balancing_normal_matrix(mask), -_balancing_right_hand_side(logarithms), rcond=1e-10)
         exponents = x[:, None, None] + x[:, None] - x
         max_exponent = (logarithms + exponents)[mask].max()
         x, exponents = x - max_exponent, exponents - max_exponent
@@ -201,12 +201,12 @@ def balance_constants(constants: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return scaled_constants, np.exp(x)
 
 
-def _balance_right_hand_side(logarithms: np.ndarray) -> np.ndarray:
+def _balancing_right_hand_side(logarithms: np.ndarray) -> np.ndarray:
     """Return the right-hand side, shape (dim,), of the normal equations of :func:`balance_constants`."""
     return logarithms.sum(axis=(1, 2)) + logarithms.sum(axis=(0, 2)) - logarithms.sum(axis=(0, 1))
 
 
-def _balance_normal_matrix(mask: np.ndarray) -> np.ndarray:
+def _balancing_normal_matrix(mask: np.ndarray) -> np.ndarray:
     """Return the matrix, shape (dim, dim), of the normal equations of :func:`balance_constants`.
 
     ``mask`` is True for the constants that take part.

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import LieAlgebraError
 from . import _solvable_types as solvable
-from ._solvable_types import Summand, distinct_eigenvalues
+from ._solvable_types import Summand, upper_eigenvalues_and_multiplicities
 from ._subspaces import brackets_of_rows, complement, coordinates, intersection, is_exact, null_space, row_space
 from .blocks import direct_sum
 from .lie_algebra import LieAlgebra
@@ -165,7 +165,7 @@ def _split_by_centroid(work: WorkingConstants) -> list[WorkingConstants]:
         random.integers(-99, 100, len(basis)).astype(object) if is_exact(basis) else random.standard_normal(len(basis))
     )
     phi = (weights @ basis).reshape(n, n)
-    eigenvalues = distinct_eigenvalues(phi)
+    eigenvalues = upper_eigenvalues_and_multiplicities(phi)
     if len(eigenvalues) == 1:
         return [work]
     values = phi.astype(np.float64)

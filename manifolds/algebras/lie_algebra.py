@@ -24,8 +24,8 @@ from .axioms import (
     STRUCTURE_TOLERANCE,
     balance_constants,
     check_axioms,
-    checked_constants,
     constants_and_matrices,
+    finite_cubic_array,
     real_columns,
 )
 from .bracket_table import algebra_html, constants_and_names
@@ -72,7 +72,7 @@ class LieAlgebra(StructureMethods):
     """Casimirs given by :meth:`with_invariants`."""
 
     def __init__(self, structure_constants, *, name: str = "g", basis=None, basis_names=None):
-        constants = checked_constants(structure_constants)
+        constants = finite_cubic_array(structure_constants)
         fractions = rational_array(constants)
         fits_int64 = fractions is not None and fractions.numerator.dtype != object
         self._rational: RationalArray | None = fractions if fits_int64 else None

@@ -106,12 +106,12 @@ def _brackets_with_ideal(**images: Mapping[int, float]) -> dict[tuple[int, int],
     return {(int(key[1]), int(key[3])): image for key, image in images.items()}
 
 
-def _constant_formulas_function(*texts: str) -> Callable[..., tuple[str, ...]]:
+def _parameter_free_formulas(*texts: str) -> Callable[..., tuple[str, ...]]:
     """Return a function that returns these formulas for all parameters."""
     return lambda **parameters: texts
 
 
-def _constant_brackets_function(brackets: Brackets) -> Callable[..., Brackets]:
+def _parameter_free_brackets(brackets: Brackets) -> Callable[..., Brackets]:
     """Return a function without parameters that returns these brackets."""
     return lambda: brackets
 
@@ -156,73 +156,73 @@ _LOG_TURN = "log(abs(e1))"
 _TURN_18 = "((e1*e3+e2*e4)/(e1**2+e2**2))"
 
 CATALOGUE: dict[str, CatalogueEntry] = {
-    "A1": CatalogueEntry(_constant_brackets_function({}), _constant_formulas_function("e1")),
-    "A2": CatalogueEntry(_constant_brackets_function({(1, 2): {1: 1}}), _constant_formulas_function()),
-    "A3,1": CatalogueEntry(_constant_brackets_function(_HEISENBERG), _constant_formulas_function("e1")),
+    "A1": CatalogueEntry(_parameter_free_brackets({}), _parameter_free_formulas("e1")),
+    "A2": CatalogueEntry(_parameter_free_brackets({(1, 2): {1: 1}}), _parameter_free_formulas()),
+    "A3,1": CatalogueEntry(_parameter_free_brackets(_HEISENBERG), _parameter_free_formulas("e1")),
     "A3,2": CatalogueEntry(
-        _constant_brackets_function(_brackets_with_ideal(e1_3={1: 1}, e2_3={1: 1, 2: 1})),
-        _constant_formulas_function("e1*exp(-e2/e1)"),
+        _parameter_free_brackets(_brackets_with_ideal(e1_3={1: 1}, e2_3={1: 1, 2: 1})),
+        _parameter_free_formulas("e1*exp(-e2/e1)"),
     ),
     "A3,3": CatalogueEntry(
-        _constant_brackets_function(_brackets_with_ideal(e1_3={1: 1}, e2_3={2: 1})),
-        _constant_formulas_function("e2/e1"),
+        _parameter_free_brackets(_brackets_with_ideal(e1_3={1: 1}, e2_3={2: 1})),
+        _parameter_free_formulas("e2/e1"),
     ),
     "A3,4": CatalogueEntry(
-        _constant_brackets_function(_brackets_with_ideal(e1_3={1: 1}, e2_3={2: -1})),
-        _constant_formulas_function("e1*e2"),
+        _parameter_free_brackets(_brackets_with_ideal(e1_3={1: 1}, e2_3={2: -1})),
+        _parameter_free_formulas("e1*e2"),
     ),
     "A3,5": CatalogueEntry(
         lambda a: _brackets_with_ideal(e1_3={1: 1}, e2_3={2: a}),
-        _constant_formulas_function("e2*abs(e1)**(-{a})"),
+        _parameter_free_formulas("e2*abs(e1)**(-{a})"),
         ("a",),
         lambda a: 0 < abs(a) < 1,
         "0 < |a| < 1",
     ),
     "A3,6": CatalogueEntry(
-        _constant_brackets_function(_brackets_with_ideal(e1_3={2: -1}, e2_3={1: 1})),
-        _constant_formulas_function("e1**2+e2**2"),
+        _parameter_free_brackets(_brackets_with_ideal(e1_3={2: -1}, e2_3={1: 1})),
+        _parameter_free_formulas("e1**2+e2**2"),
     ),
     "A3,7": CatalogueEntry(
         lambda a: _brackets_with_ideal(e1_3={1: a, 2: -1}, e2_3={1: 1, 2: a}),
-        _constant_formulas_function(f"(e1*cos({_SPIRAL})+e2*sin({_SPIRAL}))/sqrt(e1**2+e2**2)"),
+        _parameter_free_formulas(f"(e1*cos({_SPIRAL})+e2*sin({_SPIRAL}))/sqrt(e1**2+e2**2)"),
         ("a",),
         lambda a: a > 0,
         "a > 0",
     ),
     "A3,8": CatalogueEntry(
-        _constant_brackets_function({(1, 3): {2: -2}, (1, 2): {1: 1}, (2, 3): {3: 1}}),
-        _constant_formulas_function("e2**2+e1*e3"),
+        _parameter_free_brackets({(1, 3): {2: -2}, (1, 2): {1: 1}, (2, 3): {3: 1}}),
+        _parameter_free_formulas("e2**2+e1*e3"),
     ),
     "A3,9": CatalogueEntry(
-        _constant_brackets_function({(1, 2): {3: 1}, (2, 3): {1: 1}, (3, 1): {2: 1}}),
-        _constant_formulas_function("e1**2+e2**2+e3**2"),
+        _parameter_free_brackets({(1, 2): {3: 1}, (2, 3): {1: 1}, (3, 1): {2: 1}}),
+        _parameter_free_formulas("e1**2+e2**2+e3**2"),
     ),
-    "A4,1": CatalogueEntry(_constant_brackets_function(_ENGEL), _constant_formulas_function("e1", "e2**2-2*e1*e3")),
+    "A4,1": CatalogueEntry(_parameter_free_brackets(_ENGEL), _parameter_free_formulas("e1", "e2**2-2*e1*e3")),
     "A4,2": CatalogueEntry(
         lambda a: _brackets_with_ideal(e1_4={1: a}, e2_4={2: 1}, e3_4={2: 1, 3: 1}),
-        _constant_formulas_function("e1*exp(-{a}*e3/e2)", "e2*exp(-e3/e2)"),
+        _parameter_free_formulas("e1*exp(-{a}*e3/e2)", "e2*exp(-e3/e2)"),
         ("a",),
         lambda a: a != 0,
         "a != 0",
     ),
     "A4,3": CatalogueEntry(
-        _constant_brackets_function(_brackets_with_ideal(e1_4={1: 1}, e3_4={2: 1})),
-        _constant_formulas_function("e2", "e1*exp(-e3/e2)"),
+        _parameter_free_brackets(_brackets_with_ideal(e1_4={1: 1}, e3_4={2: 1})),
+        _parameter_free_formulas("e2", "e1*exp(-e3/e2)"),
     ),
     "A4,4": CatalogueEntry(
-        _constant_brackets_function(_brackets_with_ideal(e1_4={1: 1}, e2_4={1: 1, 2: 1}, e3_4={2: 1, 3: 1})),
-        _constant_formulas_function("e1*exp(-e2/e1)", f"{_CHAIN_2}/e1**2"),
+        _parameter_free_brackets(_brackets_with_ideal(e1_4={1: 1}, e2_4={1: 1, 2: 1}, e3_4={2: 1, 3: 1})),
+        _parameter_free_formulas("e1*exp(-e2/e1)", f"{_CHAIN_2}/e1**2"),
     ),
     "A4,5": CatalogueEntry(
         lambda a, b: _brackets_with_ideal(e1_4={1: 1}, e2_4={2: a}, e3_4={3: b}),
-        _constant_formulas_function("e2*abs(e1)**(-{a})", "e3*abs(e1)**(-{b})"),
+        _parameter_free_formulas("e2*abs(e1)**(-{a})", "e3*abs(e1)**(-{b})"),
         ("a", "b"),
         lambda a, b: a * b != 0 and -1 <= a <= 1 and -1 <= b <= 1,
         "a b != 0, |a| <= 1, |b| <= 1",
     ),
     "A4,6": CatalogueEntry(
         lambda a, b: _brackets_with_ideal(e1_4={1: a}, e2_4={2: b, 3: -1}, e3_4={2: 1, 3: b}),
-        _constant_formulas_function(
+        _parameter_free_formulas(
             "(e2**2+e3**2)*abs(e1)**(-2*{b}/{a})",
             f"(e2*cos({_LOG_TURN}/{{a}})+e3*sin({_LOG_TURN}/{{a}}))*abs(e1)**(-{{b}}/{{a}})",
         ),
@@ -231,98 +231,96 @@ CATALOGUE: dict[str, CatalogueEntry] = {
         "a != 0, b >= 0",
     ),
     "A4,7": CatalogueEntry(
-        _constant_brackets_function(_HEISENBERG | _brackets_with_ideal(e1_4={1: 2}, e2_4={2: 1}, e3_4={2: 1, 3: 1})),
-        _constant_formulas_function(),
+        _parameter_free_brackets(_HEISENBERG | _brackets_with_ideal(e1_4={1: 2}, e2_4={2: 1}, e3_4={2: 1, 3: 1})),
+        _parameter_free_formulas(),
     ),
     "A4,8": CatalogueEntry(
-        _constant_brackets_function(_HEISENBERG | _brackets_with_ideal(e2_4={2: 1}, e3_4={3: -1})),
-        _constant_formulas_function("e1", "e2*e3-e1*e4"),
+        _parameter_free_brackets(_HEISENBERG | _brackets_with_ideal(e2_4={2: 1}, e3_4={3: -1})),
+        _parameter_free_formulas("e1", "e2*e3-e1*e4"),
     ),
     "A4,9": CatalogueEntry(
         lambda b: _HEISENBERG | _brackets_with_ideal(e1_4={1: 1 + b}, e2_4={2: 1}, e3_4={3: b}),
-        _constant_formulas_function(),
+        _parameter_free_formulas(),
         ("b",),
         lambda b: -1 < b <= 1,
         "-1 < b <= 1",
     ),
     "A4,10": CatalogueEntry(
-        _constant_brackets_function(_HEISENBERG | _brackets_with_ideal(e2_4={3: -1}, e3_4={2: 1})),
-        _constant_formulas_function("e1", "2*e1*e4+e2**2+e3**2"),
+        _parameter_free_brackets(_HEISENBERG | _brackets_with_ideal(e2_4={3: -1}, e3_4={2: 1})),
+        _parameter_free_formulas("e1", "2*e1*e4+e2**2+e3**2"),
     ),
     "A4,11": CatalogueEntry(
         lambda a: _HEISENBERG | _brackets_with_ideal(e1_4={1: 2 * a}, e2_4={2: a, 3: -1}, e3_4={2: 1, 3: a}),
-        _constant_formulas_function(),
+        _parameter_free_formulas(),
         ("a",),
         lambda a: a > 0,
         "a > 0",
     ),
     "A4,12": CatalogueEntry(
-        _constant_brackets_function({(1, 3): {1: 1}, (2, 3): {2: 1}, (1, 4): {2: -1}, (2, 4): {1: 1}}),
-        _constant_formulas_function(),
+        _parameter_free_brackets({(1, 3): {1: 1}, (2, 3): {2: 1}, (1, 4): {2: -1}, (2, 4): {1: 1}}),
+        _parameter_free_formulas(),
     ),
     "A5,1": CatalogueEntry(
-        _constant_brackets_function(_brackets_with_ideal(e3_5={1: 1}, e4_5={2: 1})),
-        _constant_formulas_function("e1", "e2", "e2*e3-e1*e4"),
+        _parameter_free_brackets(_brackets_with_ideal(e3_5={1: 1}, e4_5={2: 1})),
+        _parameter_free_formulas("e1", "e2", "e2*e3-e1*e4"),
     ),
     "A5,2": CatalogueEntry(
-        _constant_brackets_function(_brackets_with_ideal(e2_5={1: 1}, e3_5={2: 1}, e4_5={3: 1})),
-        _constant_formulas_function("e1", "e2**2-2*e1*e3", _CHAIN_3),
+        _parameter_free_brackets(_brackets_with_ideal(e2_5={1: 1}, e3_5={2: 1}, e4_5={3: 1})),
+        _parameter_free_formulas("e1", "e2**2-2*e1*e3", _CHAIN_3),
     ),
     "A5,3": CatalogueEntry(
-        _constant_brackets_function({(3, 4): {2: 1}, (3, 5): {1: 1}, (4, 5): {3: 1}}),
-        _constant_formulas_function("e1", "e2", "e3**2+2*e2*e5-2*e1*e4"),
+        _parameter_free_brackets({(3, 4): {2: 1}, (3, 5): {1: 1}, (4, 5): {3: 1}}),
+        _parameter_free_formulas("e1", "e2", "e3**2+2*e2*e5-2*e1*e4"),
     ),
-    "A5,4": CatalogueEntry(
-        _constant_brackets_function({(2, 4): {1: 1}, (3, 5): {1: 1}}), _constant_formulas_function("e1")
-    ),
+    "A5,4": CatalogueEntry(_parameter_free_brackets({(2, 4): {1: 1}, (3, 5): {1: 1}}), _parameter_free_formulas("e1")),
     "A5,5": CatalogueEntry(
-        _constant_brackets_function({(3, 4): {1: 1}, (2, 5): {1: 1}, (3, 5): {2: 1}}), _constant_formulas_function("e1")
+        _parameter_free_brackets({(3, 4): {1: 1}, (2, 5): {1: 1}, (3, 5): {2: 1}}), _parameter_free_formulas("e1")
     ),
     "A5,6": CatalogueEntry(
-        _constant_brackets_function({(3, 4): {1: 1}, (2, 5): {1: 1}, (3, 5): {2: 1}, (4, 5): {3: 1}}),
-        _constant_formulas_function("e1"),
+        _parameter_free_brackets({(3, 4): {1: 1}, (2, 5): {1: 1}, (3, 5): {2: 1}, (4, 5): {3: 1}}),
+        _parameter_free_formulas("e1"),
     ),
     "A5,7": CatalogueEntry(
         lambda a, b, c: _brackets_with_ideal(e1_5={1: 1}, e2_5={2: a}, e3_5={3: b}, e4_5={4: c}),
-        _constant_formulas_function("e2*abs(e1)**(-{a})", "e3*abs(e1)**(-{b})", "e4*abs(e1)**(-{c})"),
+        _parameter_free_formulas("e2*abs(e1)**(-{a})", "e3*abs(e1)**(-{b})", "e4*abs(e1)**(-{c})"),
         ("a", "b", "c"),
         lambda a, b, c: a * b * c != 0 and max(abs(a), abs(b), abs(c)) <= 1,
         "a b c != 0, |a|, |b|, |c| <= 1",
     ),
     "A5,8": CatalogueEntry(
         lambda c: _brackets_with_ideal(e2_5={1: 1}, e3_5={3: 1}, e4_5={4: c}),
-        _constant_formulas_function("e1", "e3*exp(-e2/e1)", "e4*exp(-{c}*e2/e1)"),
+        _parameter_free_formulas("e1", "e3*exp(-e2/e1)", "e4*exp(-{c}*e2/e1)"),
         ("c",),
         lambda c: 0 < abs(c) <= 1,
         "0 < |c| <= 1",
     ),
     "A5,9": CatalogueEntry(
         lambda b, c: _brackets_with_ideal(e1_5={1: 1}, e2_5={1: 1, 2: 1}, e3_5={3: b}, e4_5={4: c}),
-        _constant_formulas_function("e1*exp(-e2/e1)", "e3*exp(-{b}*e2/e1)", "e4*exp(-{c}*e2/e1)"),
+        _parameter_free_formulas("e1*exp(-e2/e1)", "e3*exp(-{b}*e2/e1)", "e4*exp(-{c}*e2/e1)"),
         ("b", "c"),
         lambda b, c: b * c != 0,
         "b c != 0",
     ),
     "A5,10": CatalogueEntry(
-        _constant_brackets_function(_brackets_with_ideal(e2_5={1: 1}, e3_5={2: 1}, e4_5={4: 1})),
-        _constant_formulas_function("e1", "e2**2-2*e1*e3", "e4*exp(-e2/e1)"),
+        _parameter_free_brackets(_brackets_with_ideal(e2_5={1: 1}, e3_5={2: 1}, e4_5={4: 1})),
+        _parameter_free_formulas("e1", "e2**2-2*e1*e3", "e4*exp(-e2/e1)"),
     ),
     "A5,11": CatalogueEntry(
         lambda c: _brackets_with_ideal(e1_5={1: 1}, e2_5={1: 1, 2: 1}, e3_5={2: 1, 3: 1}, e4_5={4: c}),
-        _constant_formulas_function("e1*exp(-e2/e1)", f"{_CHAIN_2}/e1**2", "e4*exp(-{c}*e2/e1)"),
+        _parameter_free_formulas("e1*exp(-e2/e1)", f"{_CHAIN_2}/e1**2", "e4*exp(-{c}*e2/e1)"),
         ("c",),
         lambda c: c != 0,
         "c != 0",
     ),
     "A5,12": CatalogueEntry(
-        _constant_brackets_function(
+        _parameter_free_brackets(
             _brackets_with_ideal(e1_5={1: 1}, e2_5={1: 1, 2: 1}, e3_5={2: 1, 3: 1}, e4_5={3: 1, 4: 1})
         ),
-        _constant_formulas_function("e1*exp(-e2/e1)", f"{_CHAIN_2}/e1**2", f"{_CHAIN_3}/e1**3"),
+        _parameter_free_formulas("e1*exp(-e2/e1)", f"{_CHAIN_2}/e1**2", f"{_CHAIN_3}/e1**3"),
     ),
     "A5,13": CatalogueEntry(
         lambda a, p, s: _brackets_with_ideal(e1_5={1: 1}, e2_5={2: a}, e3_5={3: p, 4: -s}, e4_5={3: s, 4: p}),
-        _constant_formulas_function(
+        _parameter_free_formulas(
             "e2*abs(e1)**(-{a})",
             "(e3**2+e4**2)*abs(e1)**(-2*{p})",
             f"(e3*cos({{s}}*{_LOG_TURN})+e4*sin({{s}}*{_LOG_TURN}))*abs(e1)**(-{{p}})",
@@ -333,7 +331,7 @@ CATALOGUE: dict[str, CatalogueEntry] = {
     ),
     "A5,14": CatalogueEntry(
         lambda p: _brackets_with_ideal(e2_5={1: 1}, e3_5={3: p, 4: -1}, e4_5={3: 1, 4: p}),
-        _constant_formulas_function(
+        _parameter_free_formulas(
             "e1",
             "(e3**2+e4**2)*exp(-2*{p}*e2/e1)",
             "(e3*cos(e2/e1)+e4*sin(e2/e1))*exp(-{p}*e2/e1)",
@@ -342,14 +340,14 @@ CATALOGUE: dict[str, CatalogueEntry] = {
     ),
     "A5,15": CatalogueEntry(
         lambda a: _brackets_with_ideal(e1_5={1: 1}, e2_5={1: 1, 2: 1}, e3_5={3: a}, e4_5={3: 1, 4: a}),
-        _constant_formulas_function("e1*exp(-e2/e1)", "e3*exp(-{a}*e2/e1)", "e4/e3-e2/e1"),
+        _parameter_free_formulas("e1*exp(-e2/e1)", "e3*exp(-{a}*e2/e1)", "e4/e3-e2/e1"),
         ("a",),
         lambda a: abs(a) <= 1,
         "|a| <= 1",
     ),
     "A5,16": CatalogueEntry(
         lambda p, s: _brackets_with_ideal(e1_5={1: 1}, e2_5={1: 1, 2: 1}, e3_5={3: p, 4: -s}, e4_5={3: s, 4: p}),
-        _constant_formulas_function(
+        _parameter_free_formulas(
             "e1*exp(-e2/e1)",
             "(e3**2+e4**2)*exp(-2*{p}*e2/e1)",
             "(e3*cos({s}*e2/e1)+e4*sin({s}*e2/e1))*exp(-{p}*e2/e1)",
@@ -371,7 +369,7 @@ CATALOGUE: dict[str, CatalogueEntry] = {
         lambda p: _brackets_with_ideal(
             e1_5={1: p, 2: -1}, e2_5={1: 1, 2: p}, e3_5={1: 1, 3: p, 4: -1}, e4_5={2: 1, 3: 1, 4: p}
         ),
-        _constant_formulas_function(
+        _parameter_free_formulas(
             "(e1*e4-e2*e3)/(e1**2+e2**2)",
             f"(e1**2+e2**2)*exp(-2*{{p}}*{_TURN_18})",
             f"(e1*cos({_TURN_18})+e2*sin({_TURN_18}))*exp(-{{p}}*{_TURN_18})",
@@ -382,29 +380,29 @@ CATALOGUE: dict[str, CatalogueEntry] = {
     ),
     "A5,19": CatalogueEntry(
         lambda a, b: _HEISENBERG | _brackets_with_ideal(e1_5={1: a}, e2_5={2: 1}, e3_5={3: a - 1}, e4_5={4: b}),
-        _constant_formulas_function("abs(e1)**{b}*abs(e4)**(-{a})"),
+        _parameter_free_formulas("abs(e1)**{b}*abs(e4)**(-{a})"),
         ("a", "b"),
         lambda a, b: b != 0,
         "b != 0",
     ),
     "A5,20": CatalogueEntry(
         lambda a: _HEISENBERG | _brackets_with_ideal(e1_5={1: a}, e2_5={2: 1}, e3_5={3: a - 1}, e4_5={1: 1, 4: a}),
-        _constant_formulas_function("e1*exp(-{a}*e4/e1)"),
+        _parameter_free_formulas("e1*exp(-{a}*e4/e1)"),
         ("a",),
     ),
     "A5,21": CatalogueEntry(
-        _constant_brackets_function(
+        _parameter_free_brackets(
             _HEISENBERG | _brackets_with_ideal(e1_5={1: 2}, e2_5={2: 1, 3: 1}, e3_5={3: 1, 4: 1}, e4_5={4: 1})
         ),
-        _constant_formulas_function("e4**2/e1"),
+        _parameter_free_formulas("e4**2/e1"),
     ),
     "A5,22": CatalogueEntry(
-        _constant_brackets_function(_HEISENBERG | _brackets_with_ideal(e2_5={3: 1}, e4_5={4: 1})),
-        _constant_formulas_function("e1"),
+        _parameter_free_brackets(_HEISENBERG | _brackets_with_ideal(e2_5={3: 1}, e4_5={4: 1})),
+        _parameter_free_formulas("e1"),
     ),
     "A5,23": CatalogueEntry(
         lambda b: _HEISENBERG | _brackets_with_ideal(e1_5={1: 2}, e2_5={2: 1, 3: 1}, e3_5={3: 1}, e4_5={4: b}),
-        _constant_formulas_function("e4**2*abs(e1)**(-{b})"),
+        _parameter_free_formulas("e4**2*abs(e1)**(-{b})"),
         ("b",),
         lambda b: b != 0,
         "b != 0",
@@ -413,7 +411,7 @@ CATALOGUE: dict[str, CatalogueEntry] = {
         lambda eps: (
             _HEISENBERG | _brackets_with_ideal(e1_5={1: 2}, e2_5={2: 1, 3: 1}, e3_5={3: 1}, e4_5={1: eps, 4: 2})
         ),
-        _constant_formulas_function("e1*exp(-2*{eps}*e4/e1)"),
+        _parameter_free_formulas("e1*exp(-2*{eps}*e4/e1)"),
         ("eps",),
         lambda eps: abs(eps) == 1,
         "eps = 1 or -1",
@@ -422,7 +420,7 @@ CATALOGUE: dict[str, CatalogueEntry] = {
         lambda b, p: (
             _HEISENBERG | _brackets_with_ideal(e1_5={1: 2 * p}, e2_5={2: p, 3: 1}, e3_5={2: -1, 3: p}, e4_5={4: b})
         ),
-        _constant_formulas_function("abs(e1)**{b}*abs(e4)**(-2*{p})"),
+        _parameter_free_formulas("abs(e1)**{b}*abs(e4)**(-2*{p})"),
         ("b", "p"),
         lambda b, p: b != 0,
         "b != 0",
@@ -432,52 +430,50 @@ CATALOGUE: dict[str, CatalogueEntry] = {
             _HEISENBERG
             | _brackets_with_ideal(e1_5={1: 2 * p}, e2_5={2: p, 3: 1}, e3_5={2: -1, 3: p}, e4_5={1: eps, 4: 2 * p})
         ),
-        _constant_formulas_function("e1*exp(-2*{p}*{eps}*e4/e1)"),
+        _parameter_free_formulas("e1*exp(-2*{p}*{eps}*e4/e1)"),
         ("p", "eps"),
         lambda p, eps: abs(eps) == 1,
         "eps = 1 or -1",
     ),
     "A5,27": CatalogueEntry(
-        _constant_brackets_function(
-            _HEISENBERG | _brackets_with_ideal(e1_5={1: 1}, e3_5={3: 1, 4: 1}, e4_5={1: 1, 4: 1})
-        ),
-        _constant_formulas_function("e1*exp(-e4/e1)"),
+        _parameter_free_brackets(_HEISENBERG | _brackets_with_ideal(e1_5={1: 1}, e3_5={3: 1, 4: 1}, e4_5={1: 1, 4: 1})),
+        _parameter_free_formulas("e1*exp(-e4/e1)"),
     ),
     "A5,28": CatalogueEntry(
         lambda a: _HEISENBERG | _brackets_with_ideal(e1_5={1: a}, e2_5={2: a - 1}, e3_5={3: 1, 4: 1}, e4_5={4: 1}),
-        _constant_formulas_function("e1*abs(e4)**(-{a})"),
+        _parameter_free_formulas("e1*abs(e4)**(-{a})"),
         ("a",),
     ),
     "A5,29": CatalogueEntry(
-        _constant_brackets_function({(2, 4): {1: 1}} | _brackets_with_ideal(e1_5={1: 1}, e2_5={2: 1}, e4_5={3: 1})),
-        _constant_formulas_function("e3"),
+        _parameter_free_brackets({(2, 4): {1: 1}} | _brackets_with_ideal(e1_5={1: 1}, e2_5={2: 1}, e4_5={3: 1})),
+        _parameter_free_formulas("e3"),
     ),
     "A5,30": CatalogueEntry(
         lambda a: _ENGEL | _brackets_with_ideal(e1_5={1: a + 1}, e2_5={2: a}, e3_5={3: a - 1}, e4_5={4: 1}),
-        _constant_formulas_function(f"abs{_CHAIN_2}**({{a}}+1)*abs(e1)**(-2*{{a}})"),
+        _parameter_free_formulas(f"abs{_CHAIN_2}**({{a}}+1)*abs(e1)**(-2*{{a}})"),
         ("a",),
     ),
     "A5,31": CatalogueEntry(
-        _constant_brackets_function(
+        _parameter_free_brackets(
             _ENGEL | _brackets_with_ideal(e1_5={1: 3}, e2_5={2: 2}, e3_5={3: 1}, e4_5={3: 1, 4: 1})
         ),
-        _constant_formulas_function(f"{_CHAIN_2}**3/e1**4"),
+        _parameter_free_formulas(f"{_CHAIN_2}**3/e1**4"),
     ),
     "A5,32": CatalogueEntry(
         lambda a: _ENGEL | _brackets_with_ideal(e1_5={1: 1}, e2_5={2: 1}, e3_5={1: a, 3: 1}),
-        _constant_formulas_function(f"{_CHAIN_2}/e1**2+2*{{a}}*log(abs(e1))"),
+        _parameter_free_formulas(f"{_CHAIN_2}/e1**2+2*{{a}}*log(abs(e1))"),
         ("a",),
     ),
     "A5,33": CatalogueEntry(
         lambda a, b: {(1, 4): {1: 1}, (3, 4): {3: b}, (2, 5): {2: 1}, (3, 5): {3: a}},
-        _constant_formulas_function("e3*abs(e1)**(-{b})*abs(e2)**(-{a})"),
+        _parameter_free_formulas("e3*abs(e1)**(-{b})*abs(e2)**(-{a})"),
         ("a", "b"),
         lambda a, b: a != 0 or b != 0,
         "a**2 + b**2 != 0",
     ),
     "A5,34": CatalogueEntry(
         lambda a: {(1, 4): {1: a}, (2, 4): {2: 1}, (3, 4): {3: 1}, (1, 5): {1: 1}, (3, 5): {2: 1}},
-        _constant_formulas_function("e1*abs(e2)**(-{a})*exp(-e3/e2)"),
+        _parameter_free_formulas("e1*abs(e2)**(-{a})*exp(-e3/e2)"),
         ("a",),
     ),
     "A5,35": CatalogueEntry(
@@ -495,24 +491,24 @@ CATALOGUE: dict[str, CatalogueEntry] = {
         "a**2 + b**2 != 0",
     ),
     "A5,36": CatalogueEntry(
-        _constant_brackets_function(_HEISENBERG | {(1, 4): {1: 1}, (2, 4): {2: 1}, (2, 5): {2: -1}, (3, 5): {3: 1}}),
-        _constant_formulas_function("e5+e2*e3/e1"),
+        _parameter_free_brackets(_HEISENBERG | {(1, 4): {1: 1}, (2, 4): {2: 1}, (2, 5): {2: -1}, (3, 5): {3: 1}}),
+        _parameter_free_formulas("e5+e2*e3/e1"),
     ),
     "A5,37": CatalogueEntry(
-        _constant_brackets_function(
+        _parameter_free_brackets(
             _HEISENBERG | {(1, 4): {1: 2}, (2, 4): {2: 1}, (3, 4): {3: 1}, (2, 5): {3: -1}, (3, 5): {2: 1}}
         ),
-        _constant_formulas_function("e5+(e2**2+e3**2)/(2*e1)"),
+        _parameter_free_formulas("e5+(e2**2+e3**2)/(2*e1)"),
     ),
     "A5,38": CatalogueEntry(
-        _constant_brackets_function({(1, 4): {1: 1}, (2, 5): {2: 1}, (4, 5): {3: 1}}), _constant_formulas_function("e3")
+        _parameter_free_brackets({(1, 4): {1: 1}, (2, 5): {2: 1}, (4, 5): {3: 1}}), _parameter_free_formulas("e3")
     ),
     "A5,39": CatalogueEntry(
-        _constant_brackets_function({(1, 4): {1: 1}, (2, 4): {2: 1}, (1, 5): {2: -1}, (2, 5): {1: 1}, (4, 5): {3: 1}}),
-        _constant_formulas_function("e3"),
+        _parameter_free_brackets({(1, 4): {1: 1}, (2, 4): {2: 1}, (1, 5): {2: -1}, (2, 5): {1: 1}, (4, 5): {3: 1}}),
+        _parameter_free_formulas("e3"),
     ),
     "A5,40": CatalogueEntry(
-        _constant_brackets_function(
+        _parameter_free_brackets(
             {
                 (1, 2): {1: 2},
                 (1, 3): {2: -1},
@@ -523,7 +519,7 @@ CATALOGUE: dict[str, CatalogueEntry] = {
                 (3, 5): {4: 1},
             }
         ),
-        _constant_formulas_function("e2*e4*e5-e1*e4**2+e3*e5**2"),
+        _parameter_free_formulas("e2*e4*e5-e1*e4**2+e3*e5**2"),
     ),
 }
 """Entry of each name."""

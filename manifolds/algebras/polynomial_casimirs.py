@@ -101,10 +101,10 @@ def _homogeneous_casimirs(g: AlgebraStructure, degree: int) -> list[Polynomial]:
     fractions = g.rational_constants
     if fractions is None:
         constants = g.structure_constants / np.abs(g.structure_constants).max()
-        generators = _generating_set(constants, tolerance=1e-8)
+        generators = _generating_basis_indices(constants, tolerance=1e-8)
     else:
         constants = fractions.numerator
-        generators = _generating_set(constants, large_prime(0))
+        generators = _generating_basis_indices(constants, large_prime(0))
     factors, conditions = _invariance_conditions(constants[:, generators], degree)
     exponents = (factors[:, :, None] == np.arange(g.dim)).sum(axis=1)
     invariants = []
@@ -166,7 +166,7 @@ def _coupled_column_groups(conditions: scipy.sparse.csc_array) -> list[np.ndarra
     return np.split(np.argsort(block_of, kind="stable"), np.cumsum(np.bincount(block_of))[:-1])
 
 
-def _generating_set(constants: np.ndarray, modulus: int = 0, tolerance: float = 0) -> list[int]:
+def _generating_basis_indices(constants: np.ndarray, modulus: int = 0, tolerance: float = 0) -> list[int]:
     """Return indices of basis elements that generate the algebra by brackets, chosen greedily in order.
 
     The span of the brackets is never overestimated: modulo a prime a rank is at most the rank over Q.

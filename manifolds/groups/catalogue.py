@@ -78,7 +78,10 @@ def SE(n: int) -> MatrixGroup:
         return replace(group, log_map=closed.log_rigid)
     if n == 3:
         group = replace(
-            group, exp_map=closed.exp_se3, log_map=closed.log_rigid, adjoint_cayley_map=closed.adjoint_cayley_se3
+            group,
+            exp_map=closed.exp_se3,
+            log_map=closed.log_rigid,
+            adjoint_cayley_map=closed.element_with_cayley_adjoint_se3,
         )
         return replace(group, cayley_map=closed.cayley_se3, inverse_cayley_map=closed.inverse_cayley_se3)
     return group
@@ -104,7 +107,9 @@ def SU(n: int) -> MatrixGroup:
     if n == 2:
         group = replace(group, exp_map=closed.exp_su2, log_map=closed.log_su2)
         return replace(
-            group, inverse_cayley_map=closed.inverse_cayley_su2, adjoint_cayley_map=closed.adjoint_cayley_gl2
+            group,
+            inverse_cayley_map=closed.inverse_cayley_su2,
+            adjoint_cayley_map=closed.element_with_cayley_adjoint_gl2,
         )
     return replace(group, cayley_map=None, adjoint_cayley_map=None)
 
@@ -120,7 +125,9 @@ def SL(n: int) -> MatrixGroup:
     """
     group = MatrixGroup(f"SL({n})", catalogue.sl(n), closed.unimodular_defect, restore_map=closed.restore_unimodular)
     if n == 2:
-        return replace(group, adjoint_cayley_map=closed.adjoint_cayley_gl2, equations=closed.symplectic_equations)
+        return replace(
+            group, adjoint_cayley_map=closed.element_with_cayley_adjoint_gl2, equations=closed.symplectic_equations
+        )
     return replace(group, cayley_map=None, adjoint_cayley_map=None, equations=closed.unimodular_equations)
 
 
@@ -138,7 +145,7 @@ def Sp(n: int) -> MatrixGroup:
         catalogue.sp(n),
         closed.symplectic_defect,
         closed.symplectic_inverse,
-        adjoint_cayley_map=closed.adjoint_cayley_gl2 if n == 1 else None,
+        adjoint_cayley_map=closed.element_with_cayley_adjoint_gl2 if n == 1 else None,
         restore_map=closed.restore_symplectic,
         equations=closed.symplectic_equations,
     )
@@ -158,7 +165,7 @@ def GL(n: int) -> MatrixGroup:
         f"GL({n})",
         catalogue.gl(n),
         closed.invertible_defect,
-        adjoint_cayley_map={1: maps.cayley, 2: closed.adjoint_cayley_gl2}.get(n),
+        adjoint_cayley_map={1: maps.cayley, 2: closed.element_with_cayley_adjoint_gl2}.get(n),
     )
 
 

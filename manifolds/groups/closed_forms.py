@@ -125,7 +125,7 @@ def inverse_cayley_su2(algebra: LieAlgebra, g: jax.Array) -> jax.Array:
     return jnp.where(_rotation_angle(w, v) <= 2 * (math.pi - HALF_TURN_MARGIN), x, jnp.nan)
 
 
-def adjoint_cayley_gl2(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+def element_with_cayley_adjoint_gl2(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Return the 2 x 2 matrix g with ``Ad(g) = cay(ad x)``: for trace 0 ``(I + X) / sqrt(det(I + X))``, X = hat(x).
 
     X^2 is a number, so that both sides of ``Ad(g) = cay(ad x)`` turn, or boost, by the same angle. NaN where
@@ -150,7 +150,7 @@ def element_with_cayley_adjoint_so4(algebra: LieAlgebra, x: jax.Array) -> jax.Ar
     return (factors[0] / norms[0]) @ (factors[1] / norms[1])
 
 
-def adjoint_cayley_se3(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
+def element_with_cayley_adjoint_se3(algebra: LieAlgebra, x: jax.Array) -> jax.Array:
     """Return the rigid motion g with ``Ad(g) = cay(ad x)``: the Cayley map of the dual rotation."""
     w, u = x[..., :3], x[..., 3:]
     translation = (u + jnp.cross(w, u) / 2) / (1.0 + _squared_length(w) / 4)

@@ -20,7 +20,7 @@ from ..algebras.blocks import direct_sum
 from ..algebras.lie_algebra import LieAlgebra
 from ..errors import ClosureError, ParameterError
 from ..matrices.exponential import CAYLEY_CONDITION_LIMIT, cayley_of, expm
-from ..matrices.linear import _matrix_square_root, _one_norm, determinant, max_abs_entry, solve, solve_near_identity
+from ..matrices.linear import _matrix_square_root, _one_norm, determinant, max_abs_entry, solve, solve_without_pivoting
 
 _NODES = np.polynomial.legendre.leggauss(32)[0][16:]
 """Nodes of Gauss quadrature of even functions on [0, 1]: half of the rule with 32 nodes on [-1, 1]."""
@@ -91,7 +91,7 @@ def adjoint_cayley(algebra: LieAlgebra, x) -> jax.Array:
     """
     adjoint, identity = _adjoint_algebra(algebra), np.eye(algebra.dim)
     A = adjoint.hat(x)[..., None, :, :]
-    values = solve_near_identity(
+    values = solve_without_pivoting(
         identity - _NODES[:, None, None] ** 2 / 4 * (A @ A), A + jnp.zeros((len(_NODES), 1, 1))
     )
     return exp(algebra, adjoint.vee((_WEIGHTS[:, None, None] * values).sum(axis=-3)) + central_part(algebra, x))
@@ -101,7 +101,7 @@ def components_from_ad_cayley(algebra: LieAlgebra, ad_cayley_matrix) -> jax.Arra
     """Return the components x, none in the centre, with ``cay(ad x)`` a given matrix near I."""
     identity = np.eye(algebra.dim)
     return _adjoint_algebra(algebra).vee(
-        2 * solve_near_identity(ad_cayley_matrix + identity, ad_cayley_matrix - identity)
+        2 * solve_without_pivoting(ad_cayley_matrix + identity, ad_cayley_matrix - identity)
     )
 
 

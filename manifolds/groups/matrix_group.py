@@ -19,7 +19,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arrays import first_nonfinite_index, first_true_index, format_index, is_traced, real_components, square_matrices
+from .._arrays import (
+    first_nonfinite_index,
+    first_true_multi_index,
+    format_index,
+    is_traced,
+    real_components,
+    square_matrices,
+)
 from .._class_members import ListedType
 from .._index_check import check_indices
 from ..algebras.lie_algebra import LieAlgebra
@@ -351,7 +358,7 @@ class MatrixGroup(metaclass=ListedType):
         if not is_traced(g):
             with jax.ensure_compile_time_eval():  # g may be a constant in a program being traced
                 is_outside = ~np.asarray(self.belongs(g, MEMBERSHIP_TOLERANCE))
-                if (index := first_true_index(is_outside)) is not None:
+                if (index := first_true_multi_index(is_outside)) is not None:
                     raise DomainError(
                         f"Ad on {self.name}: g{format_index(index)} {self._why_not_in_domain(np.asarray(g[index]))}"
                     )

@@ -91,7 +91,7 @@ def solve(a, b) -> jax.Array:
     )
 
 
-def solve_near_identity(a, b) -> jax.Array:
+def solve_without_pivoting(a, b) -> jax.Array:
     """Solve ``a x = b`` without pivoting, for matrices whose symmetric part is positive definite.
 
     In a program of scalars the search for pivots would be most of the work. Batches broadcast.
@@ -140,7 +140,7 @@ def conjugate_by_collocation_stages(B, w, A) -> jax.Array:
     """
     s, n = B.shape[:2]
     table = (A[:, None, :, None] * _remove_trace(B).swapaxes(0, 1)).reshape(s * n, s * n)
-    solver = solve_near_identity if s == 1 else solve  # whose matrix is 1 less a skew-Hermitian one
+    solver = solve_without_pivoting if s == 1 else solve  # whose matrix is 1 less a skew-Hermitian one
     stages = solver(np.eye(s * n) - table, jnp.asarray(np.tile(np.eye(n, dtype=B.dtype), (s, 1)))).reshape(s, n, n)
     return stages @ w @ adjoint(stages)
 

@@ -352,7 +352,7 @@ class SpectralFunction:
     function: ScalarFunction
 
     def decompose(self, a, unrolled: bool) -> tuple[jax.Array, jax.Array]:
-        return _eigenvectors(a)
+        return _eigenvalues_and_vectors(a)
 
     def chain(self, decompositions, slots, shifts, directions, unrolled: bool) -> jax.Array:
         eigensystems = decompositions
@@ -376,7 +376,7 @@ class SpectralFunction:
         return vectors[0] @ middle @ adjoints[-1]
 
 
-def _eigenvectors(a) -> tuple[jax.Array, jax.Array]:
+def _eigenvalues_and_vectors(a) -> tuple[jax.Array, jax.Array]:
     """Return the eigenvalues of the Hermitian part of a, in no order, and orthonormal eigenvectors as columns."""
     a = (a + adjoint(a)) / 2
     if a.shape[-1] > MAX_JACOBI_ROWS:
@@ -400,7 +400,7 @@ def ordered_eigenvectors(a) -> tuple[jax.Array, jax.Array]:
     ----------
     a : array, shape (n, n)
     """
-    values, vectors = _eigenvectors(a)
+    values, vectors = _eigenvalues_and_vectors(a)
     if a.shape[-1] > MAX_JACOBI_ROWS:  # LAPACK sorts them
         return values, vectors
     index = np.arange(a.shape[-1])

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arrays import first_true_index, format_index, is_traced
+from .._arrays import first_true_multi_index, format_index, is_traced
 from .._class_members import ListedABCMeta
 from .._pytree_module import Module, forward_to
 from ..errors import DomainError, SpaceError
@@ -82,7 +82,7 @@ class Retraction(metaclass=ListedABCMeta):
         """
         z, v = self._checked_step(z, v, h)
         reach = run_kernel(self, "_reach", (), z, v)
-        if not is_traced(reach) and (index := first_true_index(~np.asarray(reach < 1.0))) is not None:
+        if not is_traced(reach) and (index := first_true_multi_index(~np.asarray(reach < 1.0))) is not None:
             radius = self.space.injectivity_radius(jnp.broadcast_arrays(z, v)[0][index])
             raise DomainError(
                 f"{self}: the step h v{format_index(index)} is {float(reach[index]):.6g} times as long as its inverse "

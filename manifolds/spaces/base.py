@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arrays import first_nonfinite_index, first_true_index, format_index, is_traced, numeric_array
+from .._arrays import first_nonfinite_index, first_true_multi_index, format_index, is_traced, numeric_array
 from ..errors import ComponentError, DomainError, OffManifoldError, ShapeError
 from ..groups.matrix_group import MEMBERSHIP_TOLERANCE
 from .maps import SpaceMaps
@@ -330,7 +330,7 @@ class Space(SpaceMaps):
             return x
         with jax.ensure_compile_time_eval():  # x may be a constant in a program being traced
             residual, values = np.asarray(self._call_compiled("_residual", x)), np.asarray(x)
-        if (index := first_true_index(~(residual <= tolerance))) is not None:
+        if (index := first_true_multi_index(~(residual <= tolerance))) is not None:
             largest_residual = float(residual[index])
             if reason := self._why_overflow(values[index]):
                 raise DomainError(f"{self.name}: {label}{format_index(index)} cannot be used: {reason}")
@@ -363,7 +363,7 @@ class Space(SpaceMaps):
     def _check_tangent(self, x, name: str, v, label: str) -> None:
         with jax.ensure_compile_time_eval():
             residual = np.asarray(self._call_compiled("_tangent_residual", x, v))
-        if (index := first_true_index(~(residual <= MEMBERSHIP_TOLERANCE))) is not None:
+        if (index := first_true_multi_index(~(residual <= MEMBERSHIP_TOLERANCE))) is not None:
             largest_residual = float(residual[index])
             raise OffManifoldError(
                 f"{self.name}: {label}{format_index(index)} is not tangent at {name}: residual {largest_residual:.3g}, "

@@ -13,7 +13,7 @@ import numpy as np
 from .._arguments import checked_size
 from .._content_keys import FrozenFunction
 from ..errors import DomainError, IndexOutOfRangeError, ParameterError, SpaceError
-from ..matrices.linear import solve_near_identity
+from ..matrices.linear import solve_without_pivoting
 from .base import MEMBERSHIP_TOLERANCE, Space, register
 from .maps import inner_by_flat
 
@@ -200,9 +200,9 @@ class LevelSet(Space):
             return self._tangential_part(x, alpha)
         g, alpha = self._metric_at(x), self.to_vector(alpha + jnp.zeros_like(x))[..., None]
         columns = self._constraint_jacobian(x).swapaxes(-1, -2)
-        vectors = solve_near_identity(g, jnp.concatenate([columns, alpha], axis=-1))
+        vectors = solve_without_pivoting(g, jnp.concatenate([columns, alpha], axis=-1))
         normal, v = vectors[..., :-1], vectors[..., -1:]
-        weights = solve_near_identity(columns.swapaxes(-1, -2) @ normal, columns.swapaxes(-1, -2) @ v)
+        weights = solve_without_pivoting(columns.swapaxes(-1, -2) @ normal, columns.swapaxes(-1, -2) @ v)
         return self.from_vector((v - normal @ weights)[..., 0])
 
     @property

@@ -15,7 +15,7 @@ from .._arrays import is_traced
 from .._class_members import ListedABCMeta
 from .._index_check import check_indices
 from ..errors import SpaceError
-from ..matrices.linear import solve_near_identity
+from ..matrices.linear import solve_without_pivoting
 
 
 class SpaceMaps(metaclass=ListedABCMeta):
@@ -256,7 +256,7 @@ class SpaceMaps(metaclass=ListedABCMeta):
         if not self._has_equations:
             return self.from_vector(constraint_change)
         rows = self._constraint_jacobian(x)
-        weights = solve_near_identity(rows @ rows.swapaxes(-1, -2), constraint_change[..., None])
+        weights = solve_without_pivoting(rows @ rows.swapaxes(-1, -2), constraint_change[..., None])
         return self.from_vector((weights * rows).sum(axis=-2))
 
     def _correction(self, x, constraint_change):

@@ -12,7 +12,7 @@ import numpy as np
 from .._arguments import checked_size
 from .._pytree_module import forward_to
 from ..errors import SpaceError
-from ..matrices.linear import solve_near_identity
+from ..matrices.linear import solve_without_pivoting
 from .base import Space, random_key, register, register_result_class
 from .constant_curvature import Euclidean, Sphere
 from .groups import SpecialOrthogonal
@@ -499,7 +499,7 @@ class TangentBundle(Space):
             P = jax.vmap(lambda w: self.tangential_part(x[: base.size], w), out_axes=1)(jnp.eye(base.size))
             return P, -rate_jacobian
         rows = base._constraint_jacobian(q)
-        pseudo_inverse = solve_near_identity(rows @ rows.T, rows).T
+        pseudo_inverse = solve_without_pivoting(rows @ rows.T, rows).T
         return jnp.eye(base.size) - pseudo_inverse @ rows, -pseudo_inverse @ rate_jacobian
 
     # -- maps ---------------------------------------------------------------------------------------------------------

@@ -110,16 +110,16 @@ class PoissonStructure(Module):
 
     def jacobi_residual(self, x) -> jax.Array:
         """Return the largest ``|Pi_il d_l Pi_jk + cyclic|`` at the point x: zero for a Poisson tensor [BFM §2.1]."""
-        x = real_components(x, self._dimension_at(x), "x")
+        x = real_components(x, self._state_dim(x), "x")
         tensor, derivative = self.tensor(x), jax.jacfwd(self.tensor)(x)
         term = jnp.einsum("il,jkl->ijk", tensor, derivative)
         return jnp.max(jnp.abs(term + term.transpose(1, 2, 0) + term.transpose(2, 0, 1)))
 
     def rank(self, x) -> int:
         """Return the rank of Pi(x): the dimension of the symplectic leaf through x."""
-        return int(np.linalg.matrix_rank(np.asarray(self.tensor(real_components(x, self._dimension_at(x), "x")))))
+        return int(np.linalg.matrix_rank(np.asarray(self.tensor(real_components(x, self._state_dim(x), "x")))))
 
-    def _dimension_at(self, x) -> int:
+    def _state_dim(self, x) -> int:
         """Return the dimension of the states; that of x if the structure has states of any dimension."""
         return jnp.shape(x)[-1] if self.dim is None else self.dim
 
@@ -255,7 +255,7 @@ class PoissonBySharp(PoissonStructure):
     def sharp(self, x, alpha) -> jax.Array: ...
 
     def tensor(self, x) -> jax.Array:
-        return jax.vmap(lambda axis: self.sharp(x, axis), out_axes=1)(jnp.eye(self._dimension_at(x)))
+        return jax.vmap(lambda axis: self.sharp(x, axis), out_axes=1)(jnp.eye(self._state_dim(x)))
 
 
 class PoissonMap(PoissonBySharp):

@@ -298,7 +298,7 @@ def check_space(M: Space, length: float = 0.5, seed: int = 0, allowed: float = 1
         def field(y):
             return M._project_tangent(y, M.from_vector(mixing_matrix @ jnp.tanh(M.to_vector(y))))
 
-        residual = np.asarray(jax.jit(partial(M.divergence, field))(x[0])) - divergence_by_volume(M, field, x[0])
+        residual = np.asarray(jax.jit(partial(M.divergence, field))(x[0])) - divergence_in_coordinates(M, field, x[0])
         suite.check_small("divergences are those of the volume", residual, scale, DIVERGENCE_TOLERANCE)
     if M.can_be_embedded:
         original_change, correction_change, tangent_change = _constraint_changes(M, x, noise)
@@ -350,7 +350,7 @@ def _constraint_changes(M: Space, x, w) -> list[np.ndarray]:
     return [np.asarray(c) for c in changes_along_three_vectors(x, np.asarray(w, dtype=M.dtype))]
 
 
-def divergence_by_volume(M: Space, field, x, step: float = 2e-3) -> float:
+def divergence_in_coordinates(M: Space, field, x, step: float = 2e-3) -> float:
     """Return ``d(sqrt(g) X^i)/dc_i / sqrt(g)`` in coordinates around a point, by differences of order four."""
     coordinates = coordinates_around(ProjectionRetraction(M), x)
 

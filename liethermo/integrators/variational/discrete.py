@@ -277,7 +277,7 @@ class DiscreteSystem(Module):
         tangential_part = self.system.tangential_part
         return tangential_part(q0, -dL_dq0 - force_minus), tangential_part(q1, dL_dq1 + force_plus)
 
-    def momentum_and_constraint_jacobian(self, q0, q1, S0, S1) -> jax.Array:
+    def end_point_jacobian(self, q0, q1, S0, S1) -> jax.Array:
         """Return the Jacobian (3.13) of momentum and constraint by (q_1, S_1), shape (n + 1, n + 1).
 
         If it is invertible, the momentum and the constraint determine q_1 and S_1, and so the step.
@@ -294,7 +294,7 @@ class DiscreteSystem(Module):
 
         (3.13) is invertible if (3.15) is, and ``D_4 P_d`` is not zero.
         """
-        matrix = self.momentum_and_constraint_jacobian(q0, q1, S0, S1)
+        matrix = self.end_point_jacobian(q0, q1, S0, S1)
         return matrix[:-1, :-1] - jnp.outer(matrix[:-1, -1], matrix[-1, :-1]) / matrix[-1, -1]
 
     def end_entropy_on_constraint(self, q0, q1, S0) -> jax.Array:

@@ -409,7 +409,7 @@ def _step_energies(method: VariationalIntegrator, system: SimpleClosedSystem, h,
 @jit_cached
 def _regularity_matrix(discrete: DiscreteSystem, q0, q1, S0, S1):
     """Return the Jacobian of the momentum and constraint by (q_1, S_1), (3.13) of the paper, shape (n + 1, n + 1)."""
-    return discrete.momentum_and_constraint_jacobian(q0, q1, S0, S1)
+    return discrete.end_point_jacobian(q0, q1, S0, S1)
 
 
 register(VariationalIntegrator.verlet(), VariationalIntegrator.midpoint(), VariationalIntegrator.symmetrised())

@@ -31,7 +31,7 @@ from ...functions.checks import checked_energy, traced_function_and_shape
 from ...functions.edges import Edges, connected_component_labels, graph_edges
 from ...functions.energy import Energy, Function, Quadratic, TimeDependent
 from ...functions.indices import pattern_of_matrix, sparsity_pattern, union_pattern
-from ...functions.mechanics import is_independent_of, is_kinetic_plus_potential
+from ...functions.mechanics import is_independent_of, is_mechanical_energy
 from ...functions.time_span import ConstantFunction, LastArgumentIgnored, required_argument_count
 from ..base import System, name_momentum_maps
 from ..domain import Domain
@@ -304,7 +304,7 @@ class ComposedSystem(System):
     ) -> bool:
         """Return whether contact friction in ``bodies`` is known to produce entropy.
 
-        It is for energies of which :func:`.is_kinetic_plus_potential` is true.
+        It is for energies of which :func:`.is_mechanical_energy` is true.
         """
         if is_traced(energy):
             return False
@@ -312,7 +312,7 @@ class ComposedSystem(System):
         momenta = structure.state_indices.p[np.isin(structure.state_indices.owner, bodies)]
         points = np.random.default_rng(0).standard_normal((2, structure.dim))
         return all(
-            isinstance(body.energy, Energy) and is_kinetic_plus_potential(body.energy, body.dim)
+            isinstance(body.energy, Energy) and is_mechanical_energy(body.energy, body.dim)
             for body in self.subsystems
             if isinstance(body.friction, str)
         ) and all(is_independent_of(term, points, momenta) for term in energy.terms[n_body_terms:])

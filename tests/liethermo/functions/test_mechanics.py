@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import liethermo as lt
 from liethermo.functions.gradients import DISCRETE_GRADIENTS
-from liethermo.functions.mechanics import is_kinetic_plus_potential
+from liethermo.functions.mechanics import is_mechanical_energy
 from tests.cases import EPS
 
 seeds = st.integers(0, 10**6)
@@ -143,10 +143,9 @@ V = lt.Potential(lambda q, S: S * q[0])
     ],
 )
 def test_which_energies_are_known_to_produce_entropy(energy, expected):
-    assert is_kinetic_plus_potential(energy, DIM) is expected
+    assert is_mechanical_energy(energy, DIM) is expected
     assert (
-        jax.eval_shape(lambda x: jnp.asarray(is_kinetic_plus_potential(lt.Quadratic(x), DIM)), jnp.ones(DIM)).dtype
-        == bool
+        jax.eval_shape(lambda x: jnp.asarray(is_mechanical_energy(lt.Quadratic(x), DIM)), jnp.ones(DIM)).dtype == bool
     )
 
 

@@ -136,7 +136,7 @@ def test_the_matrix_of_regularity():
 
 def _matrices(discrete, x):
     r = x[:1], x[1:2], x[2], x[3]
-    return discrete.momentum_and_constraint_jacobian(*r), discrete.reduced_regularity_matrix(*r)
+    return discrete.end_point_jacobian(*r), discrete.reduced_regularity_matrix(*r)
 
 
 def test_a_map_of_one_s_own():

@@ -12,7 +12,7 @@ import manifolds as mf
 from liethermo.learn import training
 from liethermo.learn.data import Trajectory, spline_states_and_rates
 from liethermo.learn.fitting import checked_noise_std
-from liethermo.learn.losses import differentiable_stepper
+from liethermo.learn.losses import prepare_differentiable_stepper
 from liethermo.learn.observation import make_observation, states_matching_observations_and_rates
 
 from . import cases
@@ -239,7 +239,7 @@ def test_the_first_states_show_the_attitudes_and_move_as_they_do():
     body = lt.models.tumbling_body((3.0, 2.0, 1.0), rate=0.08)
     (t, R), *_ = _attitudes(0.0)
     observation = make_observation(body, None, lambda x, R: R)
-    run = differentiable_stepper(body, lt.MetriplecticRungeKutta(4), 1, True)[0]
+    run = prepare_differentiable_stepper(body, lt.MetriplecticRungeKutta(4), 1, True)[0]
     smoothed_data = spline_states_and_rates(Trajectory(t, R.reshape(-1, 9)), None)
     states = states_matching_observations_and_rates(observation, run, [(t, *smoothed_data)], np.ones(9), 1.0, None)[0]
     true = lt.integrate(body, np.random.default_rng(0).standard_normal(3), (0.0, 8.0), 0.05, save_every=4)
