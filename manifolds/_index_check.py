@@ -103,7 +103,7 @@ def _check_and_evaluate_indices(
         if name in INDEX_ACCESSES:
             for index, axis_length in _invalid_indices(eqn, values, caller or eqn):
                 error = IndexOutOfRangeError(
-                    index, axis_length, user_source_line(caller or eqn), access=_out_of_range_effect(eqn)
+                    index, axis_length, user_source_line(caller or eqn), access=_bad_index_effect(eqn)
                 )
                 if name != "gather" or eqn.invars[1].aval.size == eqn.invars[1].aval.shape[-1]:
                     raise error
@@ -143,7 +143,7 @@ def _calls_function_of_jax(eqn) -> bool:
     return filename is not None and not is_user_file(Path(filename))
 
 
-def _out_of_range_effect(eqn) -> str:
+def _bad_index_effect(eqn) -> str:
     """Return "read" or "write" for an access that moves an index out of range, "fill" or "drop" if it skips it."""
     reads = eqn.primitive.name in ("gather", "dynamic_slice")
     if eqn.params.get("mode") == ScatterMode.FILL_OR_DROP:
