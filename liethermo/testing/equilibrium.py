@@ -96,7 +96,8 @@ def check_equilibrium(
         suite.rows.append(check)
         if check.axiom == MEASURE_ROW and check.residual > check.tolerance and samples is None:
             raise ValueError(
-                f"the motion does not conserve the measure, so the equilibrium is not known. Give a density to lt.Fluctuations, or samples=\n{report}"
+                "the motion does not conserve the measure, so the equilibrium is not known. Give a density to "
+                f"lt.Fluctuations, or samples=\n{report}"
             )
     starts = np.broadcast_to(np.atleast_2d(np.asarray(x0, dtype=float)), (paths, system.dim))
     save_every = max(1, round(time / step / (2 * N_AVERAGED_STATES)))
