@@ -20,7 +20,7 @@ def test_a_start_page_begins_with_a_picture_and_what_one_needs(page):
     beginning = text.partition("\n## ")[0]
     assert f"images/cards/{page.stem}.png" in beginning
     assert re.search(r"^You need: ", beginning, re.MULTILINE)
-    assert "## 1. Install\n\n{doc}`install` has the line." in text
+    assert "## 1. Install\n\nThe page {doc}`install` has the command." in text
     assert "<!-- picture:" in text
 
 
