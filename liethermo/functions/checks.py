@@ -15,17 +15,11 @@ from ..tracing.interpret import polynomial_degree_bound
 from ..tracing.searches import iterate_equations
 from ..tracing.trace_errors import TRACE_ERRORS, trace_error_message
 from ..tracing.traced import TracedFunction, trace_callables_and_result_shapes
-from .energy import Energy, Function, Multiple, Negative, Pullback, SpanLimitedEnergy, StateTimeEnergy, Sum
+from .energy import Energy, Function, Pullback, SpanLimitedEnergy, StateTimeEnergy, map_operands
 
 
 def with_polynomial_degrees(energy: Energy, dim: int) -> Energy:
     """Return the energy with the degree set in each of its plain functions that is written as a polynomial."""
-    if isinstance(energy, Sum):
-        return Sum(tuple(with_polynomial_degrees(term, dim) for term in energy.summands))
-    if isinstance(energy, Negative):
-        return Negative(with_polynomial_degrees(energy.term, dim))
-    if isinstance(energy, Multiple):
-        return Multiple(with_polynomial_degrees(energy.term, dim), energy.factor)
     if isinstance(energy, StateTimeEnergy):
         return StateTimeEnergy(with_polynomial_degrees(energy.energy, dim))
     if isinstance(energy, SpanLimitedEnergy):
@@ -38,7 +32,7 @@ def with_polynomial_degrees(energy: Energy, dim: int) -> Energy:
     if isinstance(energy, Function) and energy.degree == math.inf:
         degree = polynomial_degree_bound(energy_value, energy, dim)
         return energy if degree == math.inf else Function(energy.function, degree)
-    return energy
+    return map_operands(energy, lambda operand: with_polynomial_degrees(operand, dim))
 
 
 def energy_value(energy: Energy, x) -> jax.Array:

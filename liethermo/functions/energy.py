@@ -689,6 +689,17 @@ class Sum(Energy):
         return sum((term.sensitivity(x) for term in self.summands[1:]), self.summands[0].sensitivity(x))
 
 
+def map_operands(energy: Energy, transform: Callable[[Energy], Energy]) -> Energy:
+    """Return a sum, negative or multiple with ``transform(operand)`` for each operand; another energy unchanged."""
+    if isinstance(energy, Sum):
+        return Sum(tuple(map(transform, energy.summands)))
+    if isinstance(energy, Negative):
+        return Negative(transform(energy.term))
+    if isinstance(energy, Multiple):
+        return Multiple(transform(energy.term), energy.factor)
+    return energy
+
+
 def function_name(energy: Energy) -> str:
     """Return the name of the Python function that an energy was made from; "" if there is none."""
     return callable_name(energy.function, "") if isinstance(energy, Function | TimeDependent) else ""

@@ -11,7 +11,7 @@ import jax
 from manifolds._pytree_module import Module
 
 from ..tracing.short_form import callable_name
-from .energy import Energy, Function, Multiple, Negative, Sum, TimeDependent
+from .energy import Energy, Function, TimeDependent, map_operands
 
 
 def functions_of_flat_states(tree, shape: tuple[int, ...]):
@@ -30,16 +30,10 @@ def functions_of_flat_states(tree, shape: tuple[int, ...]):
 
 def _energy_of_flat_states(energy: Energy, shape: tuple[int, ...]) -> Energy:
     """Return an energy whose plain functions of states of this shape became functions of flat states."""
-    if isinstance(energy, Sum):
-        return Sum(tuple(_energy_of_flat_states(term, shape) for term in energy.summands))
-    if isinstance(energy, Negative):
-        return Negative(_energy_of_flat_states(energy.term, shape))
-    if isinstance(energy, Multiple):
-        return Multiple(_energy_of_flat_states(energy.term, shape), energy.factor)
     if isinstance(energy, Function | TimeDependent):
         is_flat = getattr(energy.function, "dim", None) == math.prod(shape)  # a Casimir of the whole algebra
         return energy if is_flat else type(energy)(_FunctionOfFlatState(energy.function, shape))
-    return energy
+    return map_operands(energy, lambda operand: _energy_of_flat_states(operand, shape))
 
 
 class _FunctionOfFlatState(Module):

@@ -25,7 +25,7 @@ from manifolds.structures.spins import (
 )
 
 from .bath_energy import BodyBathsEnergy
-from .energy import Energy, Multiple, Negative, Pullback, Quadratic, Sum, TimeDependent
+from .energy import Energy, Multiple, Negative, Pullback, Quadratic, Sum, TimeDependent, map_operands
 from .indices import ComponentMap
 from .magnetism.spin_energy import SpinEnergy, flatten_covectors, lattice_spin_components
 
@@ -185,10 +185,8 @@ def _term_in_component_order(term: Energy, n_spins: int) -> Energy:
     """Return one summand of an energy as a function of states that are ordered component by component."""
     if isinstance(term, BodyBathsEnergy):
         return BodyBathsEnergy(energy_in_component_order(term.body, n_spins), term.baths, term.body_dim, term.dim)
-    if isinstance(term, Negative):
-        return Negative(energy_in_component_order(term.term, n_spins))
-    if isinstance(term, Multiple):
-        return Multiple(energy_in_component_order(term.term, n_spins), term.factor)
+    if isinstance(term, Negative | Multiple):
+        return map_operands(term, lambda operand: energy_in_component_order(operand, n_spins))
     return Pullback(term, ComponentToSiteOrder(n_spins))
 
 
