@@ -46,14 +46,12 @@ def state_shape_dtype(dim: int):
 
 def checked_rate(rate) -> jax.Array:
     """Return a rate as one nonnegative number (or a traced one)."""
-    array = checked_numbers(rate, "a rate", ())
-    RATE_CONDITION.require(array)
-    return array
+    return checked_rates(rate, ())
 
 
-def checked_rates(rates) -> jax.Array:
-    """Return a rate, or one for each site, as an array of nonnegative numbers (or traced ones)."""
-    array = checked_numbers(rates, "a rate")
+def checked_rates(rates, *shapes: tuple[int, ...]) -> jax.Array:
+    """Return a rate, or one for each site, as an array of nonnegative numbers (or traced ones) of one of the shapes."""
+    array = checked_numbers(rates, "a rate", *shapes)
     RATE_CONDITION.require(array)
     return array
 

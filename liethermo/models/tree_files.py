@@ -307,15 +307,13 @@ class _MjcfReader:
     def _check_free_joint(self, body: Element, name: str) -> None:
         """Raise InputError if the free joint of a body has springs, dampers or an attribute that is not covered."""
         text = f"the free joint of {name!r}"
-        if (freejoint := body.find("freejoint")) is not None:  # the defaults of joints do not act on it
-            _refuse_unknown_attributes(freejoint, text, {"name", "group", "align"})
-            if freejoint.get("align") == "true":
-                raise InputError(f"align='true' of {text} is not covered, because it turns the axes of the base")
-            return
-        joint = Element("joint", self.joint_defaults | body.findall("joint")[0].attrib)
-        for attribute in MJCF_FREE_JOINT_LOADS:
-            _refuse_nonzero_attribute(joint, attribute, text)
-        _refuse_unknown_attributes(joint, text, MJCF_JOINT_ATTRIBUTES | {*MJCF_FREE_JOINT_LOADS, "ref", "align"})
+        joint, covered = body.find("freejoint"), {"name", "group", "align"}
+        if joint is None:  # the defaults of joints do not act on a freejoint
+            joint = Element("joint", self.joint_defaults | body.findall("joint")[0].attrib)
+            covered = MJCF_JOINT_ATTRIBUTES | {*MJCF_FREE_JOINT_LOADS, "ref", "align"}
+            for attribute in MJCF_FREE_JOINT_LOADS:
+                _refuse_nonzero_attribute(joint, attribute, text)
+        _refuse_unknown_attributes(joint, text, covered)
         if joint.get("align") == "true":
             raise InputError(f"align='true' of {text} is not covered, because it turns the axes of the base")
 
