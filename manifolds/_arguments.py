@@ -10,9 +10,14 @@ import numpy as np
 from .errors import ParameterError, SizeError
 
 
+def is_integer(value) -> bool:
+    """Return whether a value is an integer of Python or NumPy, and not a truth value."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+
+
 def checked_size(value: int, minimum: int, name: str, label: str = "n") -> int:
     """Return ``value`` as an int, after checking that it is an integer and at least ``minimum``."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+    if not is_integer(value):
         raise ParameterError(f"{name}: {label} must be an integer, got {value!r}")
     if value < minimum:
         raise ParameterError(f"{name}: {label} must be at least {minimum}, got {value}")

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._arguments import is_integer
 from manifolds._precision import with_library_settings
 from manifolds.errors import ManifoldsError, warn
 
@@ -472,7 +473,7 @@ def _check_integer(name: str, value: Any, minimum: int, is_optional: bool) -> No
     """Raise InputError unless a value is an integer >= ``minimum``, or None if it is optional."""
     if is_optional and value is None:
         return
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
+    if not is_integer(value) or value < minimum:
         raise InputError(f"{name} must be an integer >= {minimum}, got {value!r}")
 
 

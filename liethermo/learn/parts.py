@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import manifolds as mf
+from manifolds._arguments import is_integer
 from manifolds._pytree_module import Module
 from manifolds.matrices.linear import skew_matrix
 
@@ -98,7 +99,7 @@ class Network(Module):
         for name, value in {"the number of components": dim, "width": width, "depth": depth}.items():
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise InputError(f"{name} must be a positive integer, got {value!r}")
-        if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        if not is_integer(seed) or seed < 0:
             raise InputError(f"seed must be an integer >= 0, got {seed!r}")
         layers = Perceptron([dim, *[width] * depth, outputs], int(seed))
         return cls(jnp.zeros(dim), jnp.ones(dim), jnp.ones(outputs), Learned(layers))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from manifolds._arguments import is_integer
 from manifolds._precision import with_library_settings
 from manifolds._tables import html_grid
 
@@ -196,7 +197,7 @@ class Ensemble(AuditableResult):
 
     def _checked_member_index(self, i) -> int:
         """Return i as an index from 0; raise InputError or IndexError if there is no such trajectory."""
-        if isinstance(i, bool) or not isinstance(i, int | np.integer):
+        if not is_integer(i):
             raise InputError(f"the index of a trajectory must be an integer, got {i!r}")
         if not -len(self) <= i < len(self):
             raise IndexError(f"the index of a trajectory must be from {-len(self)} to {len(self) - 1}, got {i}")

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
+from manifolds._arguments import is_integer
 from manifolds._class_members import ListedType
 
 from ..dissipation.geometry import divergence_summands_of_fields
@@ -163,7 +164,7 @@ class Fluctuations(metaclass=ListedType):
             _require_nonnegative_number("the temperature", self.temperature)
         seeds = self.seeds
         for name, numbers, bits in (("seed", seeds, 63), ("first", [self.first], 31)):
-            are_integers = all(isinstance(n, int | np.integer) and not isinstance(n, bool) for n in numbers)
+            are_integers = all(is_integer(n) for n in numbers)
             if not (are_integers and all(0 <= n < 2**bits for n in numbers)):
                 raise InputError(f"{name} must be an integer from 0 to 2^{bits} - 1, got {getattr(self, name)!r}")
         if len(set(seeds)) < len(seeds):

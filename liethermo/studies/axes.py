@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from manifolds._arguments import is_integer
+
 from ..errors import InputError
 
 RESERVED_NAMES = ("status", "message", "laws", "quantity", "zarr.json")
@@ -196,7 +198,7 @@ def _sample_from_ranges(draw_unit_sample, ranges: Mapping[str, Any]) -> Zipped:
 
 def _checked_count(count) -> int:
     """Return the number of points as an int; raise InputError unless it is a positive integer."""
-    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+    if not is_integer(count) or count < 1:
         raise InputError(f"the number of points must be a positive integer, got {count!r}")
     return int(count)
 

@@ -26,7 +26,7 @@ from ..functions.checks import traced_function_and_shape
 from ..functions.conditions import checked_numbers, nonnegative_condition, positive_condition
 from ..functions.energy import Energy
 from ..functions.flat_states import functions_of_flat_states
-from ..functions.magnetism.spin_energy import check_finite, checked_site_values, lattice_shape
+from ..functions.magnetism.spin_energy import checked_finite_numbers, checked_site_values, lattice_shape
 from ..functions.magnetism.spin_torques import checked_spin_torque
 from ..functions.on_spaces import (
     HalfSquareOfSpin,
@@ -221,7 +221,7 @@ class SpinSystem(TorqueSystem):
         """
         positive_condition("the angle").require(checked_numbers(angle, "the angle", ()))
         nonnegative_condition("boltzmann").require(checked_numbers(boltzmann, "boltzmann", ()))
-        check_finite(checked_numbers(t, "the time", ()), "the time")
+        checked_finite_numbers(t, "the time", ())
         state, spins, n = self.state(x), self._spin_structure, self.body_dim
         assert spins is not None
         system = self.at_time(t)

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arguments import checked_names
+from .._arguments import checked_names, is_integer
 from .._arrays import real_components
 from ..errors import LieAlgebraError, ParameterError, ShapeError, warn
 from ._subspaces import numerical_null_space
@@ -404,7 +404,7 @@ def casimirs(g: AlgebraStructure, degree: int) -> list[Polynomial | TracePolynom
         If the algebra has Casimirs but no polynomial one of this degree or below. A semisimple algebra gives no
         warning: its Casimirs are polynomials, of degree 2 and more [Chevalley].
     """
-    if isinstance(degree, bool) or not isinstance(degree, int | np.integer) or degree < 1:
+    if not is_integer(degree) or degree < 1:
         raise ParameterError(f"the degree of a Casimir must be an integer >= 1, got {degree!r}")
     casimir_list: list[Polynomial | TracePolynomial]
     try:
@@ -428,7 +428,7 @@ def casimirs(g: AlgebraStructure, degree: int) -> list[Polynomial | TracePolynom
 
 def casimirs_up_to(g: AlgebraStructure, max_degree: int) -> list:
     """Return the polynomial Casimirs of degrees 1 to ``max_degree``; the warning of :func:`casimirs` comes once."""
-    if isinstance(max_degree, bool) or not isinstance(max_degree, int | np.integer) or max_degree < 1:
+    if not is_integer(max_degree) or max_degree < 1:
         raise ParameterError(f"max_degree must be an integer >= 1, got {max_degree!r}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NoPolynomialCasimirWarning)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arguments import check_memory
+from .._arguments import check_memory, is_integer
 from .._arrays import is_traced, real_components, square_matrices
 from .._pytree_module import forward_to
 from ..errors import LieAlgebraError, ParameterError
@@ -238,7 +238,7 @@ class MatrixAlgebra(BracketAlgebra):
         LieAlgebraError
             If the degree is that of the Pfaffian, which is not formed for large matrices.
         """
-        if isinstance(degree, bool) or not isinstance(degree, int | np.integer) or degree < 1:
+        if not is_integer(degree) or degree < 1:
             raise ParameterError(f"the degree of a Casimir must be an integer >= 1, got {degree!r}")
         if degree == self.classical_data.pfaffian_degree:
             raise LieAlgebraError(

@@ -24,7 +24,7 @@ from ..conditions import checked_numbers
 from ..energy import Energy, Sum
 from ..indices import clique_pattern
 from .lattices import Bonds, Lattice
-from .spin_energy import SpinEnergy, bond_component_indices, check_finite
+from .spin_energy import SpinEnergy, bond_component_indices, checked_finite_numbers
 
 
 def exchange_tensor(bonds, tensors) -> Energy:
@@ -111,7 +111,7 @@ def _check_pairs_of_shells(lattice: Lattice, shells: list[Bonds]) -> None:
 def _scalar_exchange(bonds: Bonds, strength) -> Energy:
     """Return the Heisenberg exchange of bonds, with one constant or one for each bond."""
     bonds.check_pairs()
-    value = check_finite(checked_numbers(strength, "an exchange constant"), "an exchange constant")
+    value = checked_finite_numbers(strength, "an exchange constant")
     cells = bonds.lattice.cells
     if not value.ndim and all(bonds.presence(k).all() for k in range(len(bonds))):
         return CrystalExchange(bonds.lattice.sites, cells, _atoms_and_offset_rows(bonds), value)
@@ -163,7 +163,7 @@ def _bond_values(bonds: Bonds, values, value_shape: tuple[int, ...], quantity_na
     They have shape ``value_shape``, or ``(*cells, *value_shape)`` where they vary between cells; they are 0 in cells
     without the bond.
     """
-    array = check_finite(checked_numbers(values, quantity_name), quantity_name)
+    array = checked_finite_numbers(values, quantity_name)
     count, cells = len(bonds), bonds.lattice.cells
     shapes = value_shape, (count, *value_shape), (count, *cells, *value_shape)
     if array.shape not in shapes:

@@ -7,10 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from manifolds._arguments import is_integer
+
 from ...errors import InputError
 from ..conditions import checked_numbers
 from .lattices import Lattice
-from .spin_energy import check_finite
+from .spin_energy import checked_finite_numbers
 
 
 class StructureFactor(NamedTuple):
@@ -117,8 +119,7 @@ def dynamic_structure_factor(
         raise InputError("times must be ascending and evenly spaced. Save states with save_every=")
     if window not in ("hann", "none"):
         raise InputError(f'window must be "hann" or "none", got {window!r}')
-    is_integer = isinstance(segments, int | np.integer) and not isinstance(segments, bool)
-    if not is_integer or segments < 1 or len(t) // segments < 2:
+    if not is_integer(segments) or segments < 1 or len(t) // segments < 2:
         raise InputError(f"segments must be a positive integer, at most half of the times, got {segments!r}")
     length = 2 * len(t) // (segments + 1)
     weights = np.ones(length) if window == "none" else 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)
@@ -143,7 +144,7 @@ def _checked_samples(spins, lattice: Lattice) -> np.ndarray:
     """Return spins with one axis of samples, shape ``(samples, *cells, atoms, 3)``."""
     if not isinstance(lattice, Lattice):
         raise InputError(f"lattice must be one of lt.magnetism.lattice, got {type(lattice).__name__}")
-    s = np.asarray(check_finite(checked_numbers(spins, "spins"), "spins"))
+    s = np.asarray(checked_finite_numbers(spins, "spins"))
     shape = (*lattice.sites, 3)
     if s.shape[-len(shape) :] != shape:
         raise InputError(f"spins must have shape (..., {', '.join(map(str, shape))}), got {s.shape}")
@@ -164,7 +165,7 @@ def _wave_vectors_and_fourier_modes(
         atom_transforms = np.fft.fftn(samples, axes=axes)
         phases = np.exp(-1j * np.einsum("...c,ac->...a", q, lattice.basis))
         return q, np.einsum("...ac,...a->...c", atom_transforms, phases)
-    q = np.asarray(check_finite(checked_numbers(wave_vectors, "wave vectors"), "wave vectors"))
+    q = np.asarray(checked_finite_numbers(wave_vectors, "wave vectors"))
     if q.shape[-1:] != (3,):
         raise InputError(f"wave vectors must have shape (..., 3), got {q.shape}")
     phases = np.exp(-1j * q.reshape(-1, 3) @ lattice.positions.reshape(-1, 3).T)

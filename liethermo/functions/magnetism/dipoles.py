@@ -19,11 +19,10 @@ from manifolds.structures.spins import Lattice as PeriodicSpins
 from manifolds.structures.spins import VectorComponents, sum_of_dots
 
 from ...errors import InputError
-from ..conditions import checked_numbers
 from ..energy import Energy
 from .ewald import COMPONENTS, dipole_tensor, ewald_kernel, transform_axes
 from .lattices import Lattice
-from .spin_energy import SpinEnergy, check_finite, checked_site_values
+from .spin_energy import SpinEnergy, checked_finite_numbers, checked_site_values
 
 
 def dipoles(positions, moment=1.0, strength=1.0, boundary: str = "tin foil") -> Energy:
@@ -58,14 +57,14 @@ def dipoles(positions, moment=1.0, strength=1.0, boundary: str = "tin foil") -> 
     >>> float(pair([0.0, 0.0, 1.0, 0.0, 0.0, 1.0]))  # head to tail, -2 / r^3
     -0.25
     """
-    strength = check_finite(checked_numbers(strength, "the strength of dipoles", ()), "the strength of dipoles")
+    strength = checked_finite_numbers(strength, "the strength of dipoles", ())
     if boundary not in ("tin foil", "vacuum"):
         raise InputError(f'the boundary of dipoles must be "tin foil" or "vacuum", got {boundary!r}')
     if isinstance(positions, Lattice):
         moments = checked_site_values(moment, positions.sites, (), "a moment")
         kernel = dipolar_lattice_kernel(positions, boundary)
         return pair_interaction_energy(positions.sites, len(positions.cells), kernel, moments, strength)
-    r = np.asarray(check_finite(checked_numbers(positions, "positions of dipoles"), "positions of dipoles"))
+    r = np.asarray(checked_finite_numbers(positions, "positions of dipoles"))
     if r.ndim != 2 or r.shape[1] != 3:
         raise InputError(f"positions of dipoles must have shape (N, 3), got {r.shape}")
     moments = checked_site_values(moment, (len(r),), (), "a moment")

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
+from manifolds._arguments import is_integer
 from manifolds._arrays import real_array
 from manifolds.structures.spins import (
     Lattice as PeriodicSpins,
@@ -275,13 +276,8 @@ def _is_edge_list(graph) -> bool:
     return (
         isinstance(graph, list | tuple)
         and len(graph) > 0
-        and all(isinstance(e, tuple) and len(e) == 3 and _is_integer(e[0]) and _is_integer(e[1]) for e in graph)
+        and all(isinstance(e, tuple) and len(e) == 3 and is_integer(e[0]) and is_integer(e[1]) for e in graph)
     )
-
-
-def _is_integer(value) -> bool:
-    """Return whether a value is an integer, and not a truth value."""
-    return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
 def _is_exchange_graph(strength, shape: tuple[int, ...]) -> bool:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from manifolds._arguments import is_integer
 from manifolds._class_members import ListedType
 
 from ...errors import InputError
@@ -140,7 +141,7 @@ def lattice(
         raise InputError(f"the basis of a lattice must have shape (atoms, 3), got {positions.shape}")
     axes = len(vectors)
     cell_counts = _axis_values(cells, axes, "cells")
-    if any(isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1 for n in cell_counts):
+    if any(not is_integer(n) or n < 1 for n in cell_counts):
         raise InputError(f"cells must be positive integers, one for each of the {axes} axes, got {cells!r}")
     for value, name in ((primitive, "primitive"), (images, "images")):
         _check_truth_values((value,), name)
@@ -297,7 +298,7 @@ class Lattice(metaclass=ListedType):
 
         In a crystal with a basis, a shell is a set of all bonds of one length.
         """
-        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+        if not is_integer(count) or count < 1:
             raise InputError(f"the number of shells must be a positive integer, got {count!r}")
         return _nearest_shells(self, int(count))
 

@@ -9,13 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._arguments import is_integer
 from manifolds._precision import with_library_settings
 
 from ...errors import ConvergenceError, InputError
-from ..conditions import checked_numbers, require_condition
+from ..conditions import checked_numbers, nonnegative_condition, positive_condition
 from ..energy import Energy, Sum
 from .site_terms import zeeman
-from .spin_energy import check_finite, checked_site_values, energy_of_spins
+from .spin_energy import check_spin_lengths, checked_finite_numbers, checked_site_values, energy_of_spins
 
 MAX_ROTATION = 0.3
 """Largest angle (radian) by which a spin turns in a step, so that a descent stays in its valley."""
@@ -93,19 +94,14 @@ def _checked_start(spins) -> jax.Array:
     start = checked_numbers(spins, "spins")
     if start.ndim < 2 or start.shape[-1] != 3 or not bool(jnp.isfinite(start).all()):
         raise InputError(f"spins must be finite numbers of shape (*sites, 3), got {start.shape}")
-    if not bool((jnp.linalg.norm(start, axis=-1) > 0.0).all()):
-        raise InputError("every spin must have a length greater than 0")
+    check_spin_lengths(start)
     return start
 
 
 def _check_stopping_criteria(tolerance, max_steps) -> None:
     """Raise InputError unless the tolerance and the number of steps are positive and finite."""
-    require_condition(
-        checked_numbers(tolerance, "the tolerance", ()),
-        lambda a: (a > 0.0) & (a < np.inf),
-        "the tolerance must be positive and finite, got {value}",
-    )
-    if isinstance(max_steps, bool) or not isinstance(max_steps, int | np.integer) or max_steps < 1:
+    positive_condition("the tolerance").require(checked_numbers(tolerance, "the tolerance", ()))
+    if not is_integer(max_steps) or max_steps < 1:
         raise InputError(f"max_steps must be a positive integer, got {max_steps!r}")
 
 
@@ -244,15 +240,13 @@ def hysteresis_loop(
     state = np.asarray(_checked_start(spins))
     sites = state.shape[:-1]
     terms = energy_of_spins(energy, sites).terms
-    values = np.asarray(check_finite(checked_numbers(fields, "fields"), "fields"))
+    values = np.asarray(checked_finite_numbers(fields, "fields"))
     if values.ndim != 2 or values.shape[1] != 3 or not len(values):
         raise InputError(f"fields must have shape (n, 3) with n >= 1, got {values.shape}")
     _check_stopping_criteria(tolerance, max_steps)
     angle = checked_numbers(perturbation, "the perturbation", ())
-    require_condition(
-        angle, lambda a: (a >= 0.0) & (a < np.inf), "the perturbation must be >= 0 and finite, got {value}"
-    )
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+    nonnegative_condition("the perturbation").require(angle)
+    if not is_integer(seed) or seed < 0:
         raise InputError(f"the seed must be an integer >= 0, got {seed!r}")
     random = np.random.default_rng(seed)
     moments = np.asarray(checked_site_values(moment, sites, (), "a moment"))

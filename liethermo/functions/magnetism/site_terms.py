@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
+from manifolds._arguments import is_integer
 from manifolds._arrays import is_traced
 from manifolds._pytree_module import Module
 from manifolds.structures.spins import Lattice as PeriodicSpins
@@ -84,7 +85,7 @@ def uniaxial_anisotropy(sites, coefficients: Mapping, axis=(0.0, 0.0, 1.0)) -> E
     """
     shape = lattice_shape(sites)
     _require_mapping(coefficients, "the coefficients of a uniaxial anisotropy", "{2: 0.5}")
-    if any(isinstance(p, bool) or not isinstance(p, int | np.integer) or p < 1 for p in coefficients):
+    if any(not is_integer(p) or p < 1 for p in coefficients):
         raise InputError(f"the powers of a uniaxial anisotropy must be positive integers, got {list(coefficients)}")
     n = checked_site_values(axis, shape, (3,), "an axis")
     frame = jnp.stack([jnp.zeros_like(n), jnp.zeros_like(n), n], axis=-2)
@@ -204,11 +205,7 @@ def _require_mapping(value, what: str, example: str) -> None:
 
 def _is_power_triple(powers) -> bool:
     """Return whether a value is a tuple of three non-negative integers."""
-    return (
-        isinstance(powers, tuple)
-        and len(powers) == 3
-        and all(isinstance(p, int | np.integer) and not isinstance(p, bool) and p >= 0 for p in powers)
-    )
+    return isinstance(powers, tuple) and len(powers) == 3 and all(is_integer(p) and p >= 0 for p in powers)
 
 
 def zeeman(sites, field, moment=1.0) -> Energy:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from manifolds._arguments import is_integer
 from manifolds._arrays import is_traced
 from manifolds.structures.spins import (
     Lattice as PeriodicSpins,
@@ -90,7 +91,7 @@ def lattice_shape(sites) -> tuple[int, ...]:
     if isinstance(sites, Lattice):
         return sites.sites
     shape = tuple(sites) if isinstance(sites, tuple | list) else (sites,)
-    is_valid = all(isinstance(n, int | np.integer) and not isinstance(n, bool) and n >= 1 for n in shape)
+    is_valid = all(is_integer(n) and n >= 1 for n in shape)
     if not shape or not is_valid:
         raise InputError(f"sites must be a positive integer, or a tuple for a lattice such as (64, 64), got {sites!r}")
     return tuple(int(n) for n in shape)
@@ -148,6 +149,17 @@ def checked_site_values(value, shape, entry_shape: tuple[int, ...], quantity_nam
         expected_shapes = f"{entry_shape} or {(*shape, *entry_shape)}" if entry_shape else f"() or {shape}"
         raise InputError(f"{quantity_name} must have shape {expected_shapes}, got {array.shape}")
     return check_finite(array, quantity_name)
+
+
+def checked_finite_numbers(value, quantity_name: str, *shapes: tuple[int, ...]) -> jax.Array:
+    """Return a user's numbers as an array of float64; InputError unless their shape fits and they are finite."""
+    return check_finite(checked_numbers(value, quantity_name, *shapes), quantity_name)
+
+
+def check_spin_lengths(spins) -> None:
+    """Raise InputError if a spin, along the last axis of an array of numbers, has the length zero."""
+    if not np.linalg.norm(np.asarray(spins), axis=-1).all():
+        raise InputError("every spin must have a length greater than 0")
 
 
 def check_finite(array: jax.Array, quantity_name: str) -> jax.Array:

@@ -19,7 +19,7 @@ from ...tracing.traced import trace_callables_and_result_shapes
 from ..conditions import checked_numbers, nonnegative_condition, positive_condition
 from ..time_span import required_argument_count
 from .lattices import Lattice
-from .spin_energy import check_finite
+from .spin_energy import checked_finite_numbers
 
 
 class Slonczewski(Module):
@@ -44,7 +44,7 @@ class Slonczewski(Module):
     field_like: jax.Array | Callable
 
     def __init__(self, polarisation, damping_like=0.0, field_like=0.0):
-        self.polarisation = check_finite(checked_numbers(polarisation, "a polarisation"), "a polarisation")
+        self.polarisation = checked_finite_numbers(polarisation, "a polarisation")
         if self.polarisation.shape[-1:] != (3,):
             raise InputError(f"a polarisation must have shape (3,) or (*sites, 3), got {self.polarisation.shape}")
         self.damping_like = _checked_amplitude(damping_like)
@@ -74,7 +74,7 @@ class SpinOrbit(Slonczewski):
 
     def __init__(self, current, damping_like=0.0, field_like=0.0, normal=(0.0, 0.0, 1.0)):
         n, j = (
-            np.asarray(check_finite(checked_numbers(value, name, (3,)), name))
+            np.asarray(checked_finite_numbers(value, name, (3,)))
             for value, name in ((normal, "the normal"), (current, "the current"))
         )
         p = np.cross(n, j)
@@ -120,10 +120,8 @@ class ZhangLi(Module):
         if not np.array_equal(cells.vectors, np.diag(self.edges)):
             raise InputError("cells must be rectangular, as those of lt.magnetism.mesh")
         self.cells, self.periodic = cells.cells, cells.periodic
-        u = check_finite(checked_numbers(velocity, "a velocity", (3,)), "a velocity")
-        b, a = (
-            check_finite(checked_numbers(value, name, ()), name) for value, name in ((beta, "beta"), (alpha, "alpha"))
-        )
+        u = checked_finite_numbers(velocity, "a velocity", (3,))
+        b, a = (checked_finite_numbers(value, name, ()) for value, name in ((beta, "beta"), (alpha, "alpha")))
         self.velocity = u * (1.0 + a * b) / (1.0 + a**2)
         self.beta = (b - a) / (1.0 + a * b)
 
@@ -154,7 +152,7 @@ def _central_difference(s, axis: int, spacing: float, is_periodic: bool) -> jax.
 def _checked_amplitude(value):
     """Return the amplitude of a torque: a function of the time unchanged, or checked numbers."""
     name = "the amplitude of a torque"
-    return value if callable(value) else check_finite(checked_numbers(value, name), name)
+    return value if callable(value) else checked_finite_numbers(value, name)
 
 
 def _evaluate_amplitude(value, t) -> jax.Array:
@@ -234,7 +232,7 @@ class LaserPulse(Module):
     def __init__(self, energy, duration, centre=0.0):
         self.energy = checked_numbers(energy, "the energy of a pulse", ())
         self.duration = checked_numbers(duration, "the duration of a pulse", ())
-        self.centre = check_finite(checked_numbers(centre, "the centre of a pulse", ()), "the centre of a pulse")
+        self.centre = checked_finite_numbers(centre, "the centre of a pulse", ())
         nonnegative_condition("the energy of a pulse").require(self.energy)
         positive_condition("the duration of a pulse").require(self.duration)
 

@@ -13,10 +13,9 @@ import numpy as np
 from manifolds._precision import with_library_settings
 
 from ...errors import InputError
-from ..conditions import checked_numbers
 from ..energy import Energy
 from .lattices import Lattice
-from .spin_energy import check_finite, energy_of_spins, lattice_shape
+from .spin_energy import check_spin_lengths, checked_finite_numbers, energy_of_spins, lattice_shape
 
 REST_TOLERANCE = 1e-5
 """Largest torque of a state of rest, relative to the largest gradient."""
@@ -71,13 +70,12 @@ def spin_wave_frequencies(
     if not isinstance(lattice, Lattice):
         raise InputError(f"lattice must be one of lt.magnetism.lattice, got {type(lattice).__name__}")
     function = energy_of_spins(energy, lattice.sites)
-    s = np.asarray(check_finite(checked_numbers(spins, "spins", (*lattice.sites, 3)), "spins"))
-    if not np.linalg.norm(s, axis=-1).all():
-        raise InputError("every spin must have a length greater than 0")
-    q = np.asarray(check_finite(checked_numbers(wave_vectors, "wave vectors"), "wave vectors"))
+    s = np.asarray(checked_finite_numbers(spins, "spins", (*lattice.sites, 3)))
+    check_spin_lengths(s)
+    q = np.asarray(checked_finite_numbers(wave_vectors, "wave vectors"))
     if q.shape[-1:] != (3,):
         raise InputError(f"wave vectors must have shape (..., 3), got {q.shape}")
-    gamma = float(check_finite(checked_numbers(ratio, "ratio", ()), "ratio"))
+    gamma = float(checked_finite_numbers(ratio, "ratio", ()))
     repeat = _checked_magnetic_cell(magnetic_cell, lattice)
     _check_spins_repeat(s, lattice, repeat)
     gradient = np.asarray(function.gradient(s.ravel())).reshape(-1, 3)
@@ -237,11 +235,10 @@ def spin_temperature(energy, spins, sites) -> float:
     """
     site_shape = lattice_shape(sites)
     function, shape = energy_of_spins(energy, site_shape), (*site_shape, 3)
-    s = np.asarray(check_finite(checked_numbers(spins, "spins"), "spins"))
+    s = np.asarray(checked_finite_numbers(spins, "spins"))
     if s.shape[-len(shape) :] != shape or not s.size:
         raise InputError(f"spins must have shape (..., {', '.join(map(str, shape))}), got {s.shape}")
-    if not np.linalg.norm(s, axis=-1).all():
-        raise InputError("every spin must have a length greater than 0")
+    check_spin_lengths(s)
     samples = jnp.asarray(s.reshape(-1, math.prod(shape)))
     count = samples.shape[1] // 3
     probes = (

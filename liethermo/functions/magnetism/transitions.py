@@ -9,7 +9,7 @@ import numpy as np
 
 from ...errors import InputError
 from ..conditions import checked_numbers, positive_condition
-from .spin_energy import check_finite
+from .spin_energy import checked_finite_numbers
 
 AUTOCORRELATION_WINDOW = 6.0
 """Window of an integrated autocorrelation time, in units of this time [Sokal 1997]."""
@@ -120,10 +120,7 @@ def cumulant_crossing(a: MagnetSamples, b: MagnetSamples) -> Estimate:
     if a.temperature != b.temperature:
         raise InputError(f"both lattices must have the same temperature, got {a.temperature:g} and {b.temperature:g}")
     squares = [_checked_squared_magnetisation(samples.magnetisation) for samples in (a, b)]
-    energies = [
-        np.asarray(check_finite(checked_numbers(samples.energy, "the energies of samples"), "the energies of samples"))
-        for samples in (a, b)
-    ]
+    energies = [np.asarray(checked_finite_numbers(samples.energy, "the energies of samples")) for samples in (a, b)]
     for square, energy in zip(squares, energies, strict=True):
         if energy.shape != square.shape:
             raise InputError(f"energies of {len(square)} samples must have shape ({len(square)},), got {energy.shape}")

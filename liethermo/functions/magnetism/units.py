@@ -9,7 +9,7 @@ import scipy.constants
 
 from ...errors import InputError
 from ..conditions import checked_numbers, nonnegative_condition, positive_condition
-from .spin_energy import check_finite
+from .spin_energy import checked_finite_numbers
 
 ELECTRON_G_FACTOR = -scipy.constants.physical_constants["electron g factor"][0]
 """g of a free electron, 2.00232."""
@@ -130,7 +130,7 @@ class Units(NamedTuple):
         """Return ``gamma / mu`` for spins of this moment, by default one Bohr magneton."""
         mu = self.moment() if moment is None else checked_numbers(moment, "a moment")
         positive_condition("a moment").require(mu)
-        factor = check_finite(checked_numbers(g, "the factor g"), "the factor g")
+        factor = checked_finite_numbers(g, "the factor g")
         return self.gamma(factor) / mu
 
 

@@ -14,6 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 
+from manifolds._arguments import is_integer
+
 from ...errors import InputError
 from ...functions.gradients import EPS
 from ...systems import System
@@ -276,7 +278,7 @@ def _coordinate_label_and_function(
             raise InputError(f"{coordinate!r} is not the name of a basis element. {cure}")
         coordinate = basis_names.index(coordinate)
     n = solution.x.shape[1]
-    if isinstance(coordinate, bool) or not isinstance(coordinate, int | np.integer) or not 0 <= coordinate < n:
+    if not is_integer(coordinate) or not 0 <= coordinate < n:
         raise InputError(f"a coordinate must be an index from 0 to {n - 1}, a name or a function, got {coordinate!r}")
     index = int(coordinate)
     label = basis_names[index] if basis_names is not None and index < len(basis_names) else rf"$\mu_{{{index + 1}}}$"
